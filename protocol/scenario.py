@@ -1,0 +1,370 @@
+"""Scenarios: every number of a run, from a TOML file into frozen, typed, checked structs.
+
+SI units and radians throughout; names with an equation number are the paper's symbols. An unknown key, a wrong type or a
+value out of range raises `ScenarioError`, whose sentence names the file, the key and the remedy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import hashlib
+import math
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+import msgspec
+import numpy as np
+import tomli_w
+from msgspec import Meta
+
+from protocol.errors import ScenarioError
+from protocol.messages import AXES, FloatArray
+
+Positive: TypeAlias = Annotated[float, Meta(gt=0.0)]
+NotNegative: TypeAlias = Annotated[float, Meta(ge=0.0)]
+Vector3: TypeAlias = tuple[float, float, float]
+Vector6: TypeAlias = tuple[float, float, float, float, float, float]
+Positive3: TypeAlias = tuple[Positive, Positive, Positive]
+Positive6: TypeAlias = tuple[Positive, Positive, Positive, Positive, Positive, Positive]
+NotNegative6: TypeAlias = tuple[NotNegative, NotNegative, NotNegative, NotNegative, NotNegative, NotNegative]
+
+ZERO6: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NANOSECONDS = 1_000_000_000
+LONGEST_S = 4_000_000.0
+"""The longest time in a scenario: 46 days; the wire counts milliseconds in 32 bits."""
+
+
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table of a scenario file: frozen, and closed to keys it does not know."""
+
+    def __post_init__(self) -> None:
+        for field, value in _floats(self):
+            if not math.isfinite(value):
+                raise ValueError(f"the value of {field} must be finite")
+
+
+def _floats(table: msgspec.Struct) -> Iterator[tuple[str, float]]:
+    for field in table.__struct_fields__:
+        value = getattr(table, field)
+        for item in value if isinstance(value, tuple) else (value,):
+            if isinstance(item, float):
+                yield field, item
+
+
+class Body(_Table, frozen=True):
+    """The rigid body of (1). Mass in kg; Ixx, Iyy, Izz in kg m^2; gravity in m/s^2."""
+
+    mass: Positive
+    inertia: Positive3
+    gravity: NotNegative
+
+
+class Initial(_Table, frozen=True):
+    """State of the plant at t = 0, and the body command that acts until the first one arrives."""
+
+    position: Vector3
+    attitude: Vector3
+    velocity: Vector3 = (0.0, 0.0, 0.0)
+    attitude_rate: Vector3 = (0.0, 0.0, 0.0)
+    command: Vector6 = ZERO6
+
+
+class Backlash(_Table, frozen=True, tag_field="model", tag="backlash"):
+    """Backlash-like hysteresis (3): slope h, slope kappa just after the start, chi per N and per N m."""
+
+    h: Positive6
+    kappa: NotNegative6
+    chi: Positive6
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for axis, h, kappa in zip(AXES, self.h, self.kappa, strict=True):
+            if kappa >= h:
+                raise ValueError(f"kappa must be below h, and is not on axis {axis} ({kappa} >= {h})")
+
+
+class Play(_Table, frozen=True, tag_field="model", tag="play"):
+    """The play operator (2): slope h, half width B in units of the command (N, N m)."""
+
+    h: Positive6
+    B: NotNegative6
+
+
+class Disturbance(_Table, frozen=True):
+    """A body force and torque after the gears, amplitude * sin(frequency * t); N, N m, rad/s."""
+
+    amplitude: Vector6
+    frequency_rad_s: NotNegative
+
+
+class Actuators(_Table, frozen=True):
+    """Limits in the body frame (N, N m), the scale of each channel on the wire, and what a stale command turns into."""
+
+    lower: Vector6
+    upper: Vector6
+    scale: Positive6
+    safe: Vector6 = ZERO6
+    staleness_s: Positive = 0.05
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for axis, low, high, scale, safe in zip(AXES, self.lower, self.upper, self.scale, self.safe, strict=True):
+            if not low <= 0.0 <= high or low == high:
+                raise ValueError(f"lower and upper must enclose zero, and do not on axis {axis} ({low}, {high})")
+            if scale < max(-low, high):
+                raise ValueError(f"scale must be at least the larger limit, and is not on axis {axis} ({scale})")
+            if not low <= safe <= high:
+                raise ValueError(f"safe must lie within the limits, and does not on axis {axis} ({safe})")
+
+
+class Delay(_Table, frozen=True):
+    """Delay from a sample to the action of its command: whole periods, and seconds."""
+
+    samples: Annotated[int, Meta(ge=0, le=1000)] = 0
+    seconds: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+
+
+class Noise(_Table, frozen=True):
+    """Standard deviation of the position (m) and of each attitude angle (rad) as measured."""
+
+    position: NotNegative = 0.0
+    attitude: NotNegative = 0.0
+
+
+class Reference(_Table, frozen=True):
+    """Reference model (12), (31), its start, and the command c(t) = amplitude sin(frequency t + phase) of (32), (33)."""
+
+    A_d: Positive6
+    B_d: Positive6
+    C_d: Vector6
+    amplitude: Vector6
+    frequency_rad_s: NotNegative6
+    phase_rad: Vector6 = ZERO6
+    initial: Vector6 = ZERO6
+
+
+class Control(_Table, frozen=True):
+    """Numbers of the laws: K (13), Lambda (11), b (15), filter time T and order of G_f, derivative pole N; PD gains."""
+
+    K: Positive6
+    Lambda: Positive6
+    b: Positive6
+    T: Positive6
+    N: Positive6
+    Kp: NotNegative6
+    Kd: NotNegative6
+    order: Annotated[int, Meta(ge=1, le=6)] = 2
+    uhat0: Vector6 = ZERO6
+    rotate_force: bool = True
+
+
+class World(_Table, frozen=True):
+    """Where the emulator says it is: for real autopilots, never for the laws. Field in gauss, temperature in Celsius."""
+
+    latitude_deg: Annotated[float, Meta(ge=-90.0, le=90.0)] = 47.397742
+    longitude_deg: Annotated[float, Meta(ge=-180.0, le=180.0)] = 8.545594
+    altitude: float = 488.0
+    magnetic_field_ned: Vector3 = (0.21523, 0.01045, 0.42774)
+    temperature_celsius: float = 15.0
+
+
+class Wire(_Table, frozen=True):
+    """Who the emulator is on the link: its MAVLink component id."""
+
+    emulator_component: Annotated[int, Meta(ge=2, le=255)] = 191
+
+
+class Scenario(_Table, frozen=True):
+    """A whole run. Times in s, rates in Hz; a period is kept in whole nanoseconds (`period_ns`)."""
+
+    name: Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9_\-]*$")]
+    description: str
+    rate_hz: Positive
+    duration_s: Positive
+    seed: Annotated[int, Meta(ge=0)]
+    law: str
+    substep_s: Positive
+    body: Body
+    initial: Initial
+    hysteresis: Backlash | Play
+    actuators: Actuators
+    reference: Reference
+    control: Control
+    delay: Delay = Delay()
+    noise: Noise = Noise()
+    disturbance: Disturbance = Disturbance(amplitude=ZERO6, frequency_rad_s=0.0)
+    world: World = World()
+    wire: Wire = Wire()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if max(1.0 / self.rate_hz, self.duration_s, self.substep_s) > LONGEST_S:
+            raise ValueError(
+                f"the period 1 / rate_hz, duration_s and substep_s must be at most {LONGEST_S:.0f} s each: "
+                "choose a higher rate or a shorter time"
+            )
+        if self.period_ns % 1000 or abs(self.period_ns * self.rate_hz / NANOSECONDS - 1.0) > 1e-9:
+            raise ValueError(
+                f"rate_hz {self.rate_hz:g} has a period of {1e6 / self.rate_hz:.3f} us, which is no whole number of "
+                "microseconds (the echo on the wire counts those): choose a rate such as 100, 200, 250, 400, 500 or 1000"
+            )
+        if self.period_ns % self.substep_ns or abs(self.substep_ns / (self.substep_s * NANOSECONDS) - 1.0) > 1e-6:
+            raise ValueError(
+                f"substep_s {self.substep_s:g} does not fit a whole number of times into the period of "
+                f"{self.period_ns / NANOSECONDS:g} s: choose substep_s = period / n"
+            )
+        if self.ticks < 1:
+            raise ValueError(f"duration_s {self.duration_s:g} is shorter than one period: make it longer")
+        if abs(self.initial.attitude[1]) > 1.4:
+            raise ValueError(
+                "initial.attitude has a pitch beyond 1.4 rad, where the equations end: choose a smaller one"
+            )
+        for axis, low, high, command in zip(
+            AXES, self.actuators.lower, self.actuators.upper, self.initial.command, strict=True
+        ):
+            if not low <= command <= high:
+                raise ValueError(f"initial.command must lie within the actuator limits, and does not on axis {axis}")
+
+    @property
+    def period_ns(self) -> int:
+        """Control period, ns."""
+        return round(NANOSECONDS / self.rate_hz)
+
+    @property
+    def substep_ns(self) -> int:
+        """Step of the integrator, ns."""
+        return max(1, round(self.substep_s * NANOSECONDS))
+
+    @property
+    def ticks(self) -> int:
+        """Number of control periods in the run; t_k = k periods, k = 0 .. ticks - 1."""
+        return round(self.duration_s * NANOSECONDS / self.period_ns)
+
+    @property
+    def delay_ns(self) -> int:
+        """From a sample to the action of its command, ns."""
+        return self.delay.samples * self.period_ns + round(self.delay.seconds * NANOSECONDS)
+
+    @property
+    def initial_motion(self) -> FloatArray:
+        """(12,) position, attitude, velocity, attitude rate at t = 0."""
+        start = self.initial
+        return np.array((*start.position, *start.attitude, *start.velocity, *start.attitude_rate))
+
+    def digest(self) -> bytes:
+        """8 bytes that two ends must share: of all but what a command line may choose for one end alone."""
+        common = msgspec.structs.replace(self, rate_hz=1000.0, substep_s=0.001, duration_s=1.0, seed=0, law="")
+        return hashlib.sha256(msgspec.json.encode(common, order="sorted")).digest()[:8]
+
+    def to_toml(self) -> str:
+        """The scenario in full, every default written out."""
+        return tomli_w.dumps(msgspec.to_builtins(self))
+
+
+def with_overrides(scenario: Scenario, **changes: Any) -> Scenario:
+    """A copy with top-level keys replaced; None leaves a key as it is. Raises `ScenarioError`."""
+    chosen = {key: value for key, value in changes.items() if value is not None}
+    document = msgspec.to_builtins(scenario) | chosen
+    return _convert(document, "the command line")
+
+
+def scenario_folder() -> Path:
+    """Where the scenarios that come with the project are: beside the packages in a checkout, within one when installed."""
+    root = Path(__file__).resolve().parent.parent
+    beside = root / "scenarios"
+    return beside if (beside / "flapper.toml").exists() else root / "fwav_hil" / "scenarios"
+
+
+def find_scenario(name: str) -> Path:
+    """The file of a path, or of the name of a scenario that comes with the project. Raises ScenarioError."""
+    path = Path(name)
+    with contextlib.suppress(OSError):  # a name too long for the system, a folder that may not be searched
+        if path.exists():
+            return path
+    known = {file.stem: file for file in sorted(scenario_folder().glob("*.toml"))}
+    if path.stem in known and path.parent.name in ("", "scenarios"):
+        return known[path.stem]
+    raise ScenarioError(f"there is no scenario {name}: give a file, or one of {', '.join(known)}")
+
+
+def load_scenario(path: Path) -> Scenario:
+    """Read and check a scenario file. Raises `ScenarioError`.
+
+    A file may begin with `extends = "other.toml"`, a file beside it: it then holds only what differs from that one.
+    """
+    return _convert(_read_document(path, ()), str(path))
+
+
+def parse_scenario(text: str, source: str) -> Scenario:
+    """Read and check the text of a whole scenario; `source` names it in errors. Raises `ScenarioError`."""
+    return _convert(_parse_document(text, source), source)
+
+
+def _read_document(path: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
+    """The tables of a file, upon those of the file it extends; `extending` holds the files on the way here."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise ScenarioError(f"cannot read the scenario {path}: {reason}") from None
+    document = _parse_document(text, str(path))
+    base = document.pop("extends", None)
+    if base is None:
+        return document
+    if not isinstance(base, str) or path.resolve() in extending:
+        raise ScenarioError(f"{path}, extends: name one other scenario file, and no circle of them")
+    return _merge(_read_document(path.parent / base, (*extending, path.resolve())), document)
+
+
+def _parse_document(text: str, source: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError, a number of too many digits, nesting too deep
+        raise ScenarioError(f"{source} is not valid TOML: {error}") from None
+
+
+def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """`base` with the keys of `changes` put in; tables are merged key by key, but a table of another model as a whole."""
+    merged = dict(base)
+    for key, value in changes.items():
+        old = merged.get(key)
+        if isinstance(old, dict) and isinstance(value, dict) and value.get("model") in (None, old.get("model")):
+            value = _merge(old, value)  # noqa: PLW2901
+        merged[key] = value
+    return merged
+
+
+def _convert(document: dict[str, Any], source: str) -> Scenario:
+    try:
+        return msgspec.convert(document, Scenario)
+    except msgspec.ValidationError as error:
+        raise ScenarioError(_sentence(str(error), source, document)) from None
+
+
+def _sentence(message: str, source: str, document: dict[str, Any]) -> str:
+    """Turn the library's message into a sentence that names the file, the key and the remedy."""
+    reason, _, path = message.partition(" - at `")
+    place = path.removesuffix("`").removeprefix("$").removeprefix(".")
+    where = f"{source}, {place}" if place else source
+    if unknown := re.search(r"unknown field `(.+)`", reason):
+        known = _known_keys(place, document)
+        near = difflib.get_close_matches(unknown[1], known, n=1)
+        remedy = f"did you mean '{near[0]}'?" if near else f"known here: {', '.join(known)}"
+        key = f"{place}.{unknown[1]}" if place else unknown[1]
+        return f"{source}: unknown key '{key}': {remedy}"
+    if missing := re.search(r"missing required field `(.+)`", reason):
+        key = f"{place}.{missing[1]}" if place else missing[1]
+        return f"{source}: the key '{key}' is missing: add it"
+    reason = reason[0].lower() + reason[1:].replace("`", "")
+    return f"{where}: {reason}" + ("" if ":" in reason else ": change this value")
+
+
+def _known_keys(place: str, document: dict[str, Any]) -> list[str]:
+    if place == "hysteresis":
+        return list((Play if document[place]["model"] == "play" else Backlash).__struct_fields__)
+    table: Any = globals()[Scenario.__annotations__[place]] if place else Scenario
+    return list(table.__struct_fields__)

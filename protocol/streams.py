@@ -1,0 +1,84 @@
+"""Every message of the link in one table: who says it, when, what it is for. The README's table is printed from it.
+
+`rate_hz` is the rate of a stream in simulation time; None means once for each tick, or on an event (see `rule`).
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterator
+from typing import NamedTuple
+
+NANOSECONDS = 1_000_000_000
+HEARTBEAT_TIMEOUT_NS = 3 * NANOSECONDS
+
+
+class End(enum.Enum):
+    """Who sends."""
+
+    EMULATOR = "emulator"
+    CONTROLLER = "controller"
+    BOTH = "both"
+
+
+class Stream(NamedTuple):
+    """One row: a MAVLink message, its sender, its rate and its rule."""
+
+    message: str
+    sender: End
+    rate_hz: float | None
+    rule: str
+
+
+STREAMS = (
+    Stream("HEARTBEAT", End.BOTH, 1.0, "who is there, and whether the controller is armed; lost after 3 s"),
+    Stream(
+        "AUTOPILOT_VERSION", End.BOTH, None, "at the start: 8 bytes of the scenario's digest; a mismatch is refused"
+    ),
+    Stream("ATT_POS_MOCAP", End.EMULATOR, None, "every tick, before it: position and attitude, all that a law reads"),
+    Stream("HIL_SENSOR", End.EMULATOR, None, "the tick: simulation time, and an IMU for real autopilots"),
+    Stream("HIL_GPS", End.EMULATOR, 10.0, "for real autopilots"),
+    Stream("HIL_ACTUATOR_CONTROLS", End.CONTROLLER, None, "one for each tick; time_usec echoes the sample it answers"),
+    Stream("POSITION_TARGET_LOCAL_NED", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
+    Stream("ATTITUDE_TARGET", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
+    Stream("COMMAND_LONG", End.BOTH, None, "to the controller: 400 (arm, disarm)"),
+    Stream("COMMAND_ACK", End.CONTROLLER, None, "the answer to it"),
+)
+
+
+def stream(message: str) -> Stream:
+    """The row of `message`. Raises KeyError where the table has none."""
+    for row in STREAMS:
+        if row.message == message:
+            return row
+    raise KeyError(f"no stream {message}")
+
+
+class Due:
+    """Says when a periodic stream is due, in the time it is asked with: first at once, then each period."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_ns = round(NANOSECONDS / rate_hz)
+        self._next_ns: int | None = None
+
+    def at(self, t_ns: int) -> bool:
+        """Whether the stream is due at `t_ns`; asking so also marks it as sent."""
+        if self._next_ns is not None and t_ns < self._next_ns:
+            return False
+        self._next_ns = (t_ns // self._period_ns + 1) * self._period_ns
+        return True
+
+
+def markdown_table() -> Iterator[str]:
+    """The lines of the table as it stands in the README."""
+    yield "| message | sent by | rate | rule |"
+    yield "| --- | --- | --- | --- |"
+    for row in STREAMS:
+        rate = f"{row.rate_hz:g} Hz" if row.rate_hz else "-"
+        yield f"| {row.message} | {row.sender.value} | {rate} | {row.rule} |"
+
+
+if __name__ == "__main__":
+    import sys
+
+    sys.stdout.writelines(line + "\n" for line in markdown_table())
