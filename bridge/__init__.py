@@ -1,0 +1,1 @@
+"""How a message travels and when: links, clocks, rate keeping, routing, recording, replay, faults, latency."""

@@ -1,0 +1,64 @@
+"""Clocks: the only place of the project that asks the system for the time.
+
+Everything that waits or measures is given a `Clock`; lockstep, real time, replay and tests differ in which one.
+"""
+
+from __future__ import annotations
+
+import abc
+import time
+
+
+class Clock(abc.ABC):
+    """Tells the time and waits for it."""
+
+    @abc.abstractmethod
+    def now_ns(self) -> int:
+        """Now, in ns since an arbitrary moment; never runs backwards."""
+
+    @abc.abstractmethod
+    def sleep_until_ns(self, t_ns: int) -> None:
+        """Return when `now_ns` has reached t_ns, or a little later."""
+
+
+class MonotonicClock(Clock):
+    """The machine's CLOCK_MONOTONIC."""
+
+    def now_ns(self) -> int:
+        """Now, in ns."""
+        return time.monotonic_ns()
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        """Sleep; returns at once where t_ns has passed."""
+        remaining_ns = t_ns - time.monotonic_ns()
+        if remaining_ns > 0:
+            time.sleep(remaining_ns * 1e-9)
+
+
+class VirtualClock(Clock):
+    """A clock that stands still until it is told to go on; sleeping moves it."""
+
+    def __init__(self, t_ns: int = 0) -> None:
+        self._t_ns = t_ns
+
+    def now_ns(self) -> int:
+        """The time it was set to, ns."""
+        return self._t_ns
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        """Jump to t_ns, never back."""
+        self._t_ns = max(self._t_ns, t_ns)
+
+    def advance_ns(self, step_ns: int) -> None:
+        """Move on by step_ns."""
+        self._t_ns += step_ns
+
+
+def unix_time_us() -> int:
+    """Microseconds since 1970, for the stamps of a log written in real time."""
+    return time.time_ns() // 1000
+
+
+def local_stamp() -> str:
+    """Date and time of day for the name of a folder, such as 2026-11-22T14-05-09."""
+    return time.strftime("%Y-%m-%dT%H-%M-%S")

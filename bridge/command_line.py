@@ -1,0 +1,113 @@
+"""What all command lines of the project share: options, how errors end a command, how status reaches a user."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from bridge.process import Report, StopFlag, end_with_parent, report_json, sit_on_core
+from protocol.errors import FwavHilError, Interrupted
+from protocol.scenario import Scenario, find_scenario, load_scenario, with_overrides
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+DEFAULT_SCENARIO = "flapper"
+DEFAULT_PORT = 14560
+
+
+def options(*decorators: Callable[[Any], Any]) -> Callable[[Command], Command]:
+    """Several click decorators as one, listed in the order of `--help`."""
+
+    def decorate(function: Command) -> Command:
+        for decorator in reversed(decorators):
+            function = decorator(function)
+        return function
+
+    return decorate
+
+
+scenario_argument = click.argument("scenario", default=DEFAULT_SCENARIO)
+rate_option = click.option("--rate", type=float, metavar="HZ", help="Control rate instead of the scenario's.")
+duration_option = click.option(
+    "--duration", type=float, metavar="S", help="Length of the run instead of the scenario's."
+)
+seed_option = click.option("--seed", type=click.IntRange(min=0), help="Seed of the noise instead of the scenario's.")
+law_option = click.option(
+    "--law", metavar="LAW", help="Law instead of the scenario's: ude, pd, dob, dob_ff, uncompensated."
+)
+clock_option = click.option(
+    "--clock", type=click.Choice(["lockstep", "realtime"]), default="lockstep", show_default=True,
+    help="lockstep: simulation time waits for every answer, so the result is the same everywhere. realtime: wall time.",
+)  # fmt: skip
+wait_option = click.option(
+    "--wait", "wait_s", type=click.FloatRange(min=0.1), default=30.0, show_default=True, metavar="S",
+    help="How long to wait for the other end to appear.",
+)  # fmt: skip
+json_option = click.option(
+    "--json", "json_path", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
+    help="Write the result as JSON to this file as well ('-': standard output; the table then goes to standard error).",
+)  # fmt: skip
+
+process_options = options(
+    click.option("--status", type=click.Choice(["text", "jsonl"]), default="text", hidden=True),
+    click.option("--core", type=int, hidden=True),
+    click.option("--spin-us", type=click.IntRange(min=0), default=0, hidden=True),
+    click.option("--with-parent", is_flag=True, hidden=True),
+)
+
+
+def chosen_scenario(name: str, **overrides: Any) -> Scenario:
+    """The scenario of a name or path, with what the command line changes. Raises ScenarioError."""
+    return with_overrides(load_scenario(find_scenario(name)), **overrides)
+
+
+def begin_process(status: str, core: int | None, *, with_parent: bool) -> tuple[Report, StopFlag]:
+    """Set a process up for its loop: signals, core, parent; returns how it reports and how it is stopped."""
+    if with_parent:
+        end_with_parent()
+    if core is not None:
+        sit_on_core(core)
+    stop = StopFlag()
+    stop.install()
+    return (report_json(sys.stdout) if status == "jsonl" else _report_text), stop
+
+
+def _report_text(event: dict[str, Any]) -> None:
+    kind = event["event"]
+    if kind == "waiting":
+        click.echo(f"waiting on {event['link']}", err=True)
+    elif kind == "started":
+        click.echo(f"started with {event['peer']}", err=True)
+    elif kind == "progress" and sys.stderr.isatty():
+        click.echo(f"\rt = {event['t_ns'] * 1e-9:7.2f} s", nl=False, err=True)
+    elif kind == "ended":
+        if sys.stderr.isatty():
+            click.echo(err=True)
+        counted = {name: count for name, count in event["counters"].items() if count}
+        click.echo("ended; " + ", ".join(f"{name} {count}" for name, count in counted.items()), err=True)
+
+
+def run_command(command: click.Command, name: str, arguments: Sequence[str] | None = None) -> int:
+    """Run a click command; returns the exit code. Every error is one line on standard error, never a traceback."""
+    try:
+        result = command.main(args=arguments, prog_name=name, standalone_mode=False)
+    except FwavHilError as error:
+        click.echo(f"{name}: {error}", err=True)
+        return error.exit_code
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        click.echo(f"{name}: interrupted", err=True)
+        return Interrupted.exit_code
+    except (BrokenPipeError, SystemExit) as ended:
+        if isinstance(ended, SystemExit) and ended.code != 1:
+            raise  # a shell asked for completions
+        # Whoever read our output has left: click and rich then exit with 1. Hand the interpreter a place to flush to.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    return result if isinstance(result, int) else 0

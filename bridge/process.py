@@ -1,0 +1,64 @@
+"""What every process of the project does alike: stop when asked, end with its parent, tell its status, sit on a core."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any, TextIO
+
+import msgspec
+
+from protocol.errors import Interrupted
+
+Report = Callable[[dict[str, Any]], None]
+"""Takes one event of a process: a dictionary with the key "event"."""
+
+
+class StopFlag:
+    """Set by SIGINT and SIGTERM; looked at where a loop may end with nothing half-written."""
+
+    def __init__(self) -> None:
+        self.requested = False
+
+    def install(self) -> None:
+        """Take over both signals in this process; a second one acts as it would by default."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, number: int, _frame: object) -> None:
+        self.requested = True
+        signal.signal(number, signal.SIG_DFL)
+
+    def check(self) -> None:
+        """Raise Interrupted where a stop was requested."""
+        if self.requested:
+            raise Interrupted("interrupted: what was recorded until then is kept")
+
+
+def end_with_parent() -> None:
+    """Have the system send SIGTERM to this process when its parent ends, however that ends (Linux only)."""
+    if sys.platform == "linux":
+        set_parent_death_signal = 1
+        ctypes.CDLL(None).prctl(set_parent_death_signal, signal.SIGTERM)
+
+
+def sit_on_core(core: int) -> None:
+    """Let this process run on one core only; left as it is where the system has no such call or refuses."""
+    if hasattr(os, "sched_setaffinity"):
+        try:
+            os.sched_setaffinity(0, {core})
+        except (OSError, ValueError, OverflowError):
+            return
+
+
+def report_json(stream: TextIO) -> Report:
+    """A report that writes one JSON object a line, for a parent process to read."""
+
+    def report(event: dict[str, Any]) -> None:
+        stream.write(msgspec.json.encode(event).decode() + "\n")
+        stream.flush()
+
+    return report

@@ -1,0 +1,69 @@
+"""What a run leaves in words and numbers: folders, JSON files, percentiles."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from protocol.errors import RunFolderError
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder for results. Raises RunFolderError."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunFolderError(f"cannot create the folder {path}: {error.strerror}; choose another with --out") from None
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write an indented JSON file in one piece: a reader sees the old file or the whole new one. Raises RunFolderError."""
+    data = msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n"
+    partial = path.with_name(path.name + ".part")
+    try:
+        partial.write_bytes(data)
+        partial.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        raise RunFolderError(f"cannot write {path}: {error.strerror}") from None
+
+
+def is_stdout(path: Path | None) -> bool:
+    """Whether a `--json` asks for standard output, which then must hold nothing else."""
+    return str(path) == "-"
+
+
+def show_json(path: Path | None, content: dict[str, Any]) -> None:
+    """Write the result of a command where its `--json` says: a file, `-` for standard output, or nowhere (None)."""
+    if path is None:
+        return
+    if is_stdout(path):
+        sys.stdout.write(msgspec.json.format(msgspec.json.encode(content), indent=2).decode() + "\n")
+        sys.stdout.flush()  # here, where it is noticed that nobody reads
+    else:
+        write_json(path, content)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file; empty where there is none. Raises RunFolderError where it is damaged."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:  # not JSON, not an object, not UTF-8
+        raise RunFolderError(f"cannot read {path}: {error}") from None
+
+
+def percentiles_us(durations_ns: Sequence[int]) -> dict[str, float | None]:
+    """p50, p99, p999 and max in microseconds; None each where there is nothing to count."""
+    if not durations_ns:
+        return dict.fromkeys(("p50", "p99", "p999", "max"))
+    p50, p99, p999, most = np.percentile(np.asarray(durations_ns), (50, 99, 99.9, 100)) / 1e3
+    return {"p50": float(p50), "p99": float(p99), "p999": float(p999), "max": float(most)}

@@ -1,0 +1,82 @@
+"""Clocks: the machine's, and the one that stands still until it is told to go on."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bridge.clock import MonotonicClock, VirtualClock, local_stamp, unix_time_us
+
+
+class TestMonotonicClock:
+    def test_it_never_runs_backwards(self) -> None:
+        clock = MonotonicClock()
+        times = [clock.now_ns() for _ in range(1000)]
+        assert times == sorted(times)
+
+    def test_it_is_the_machines(self) -> None:
+        before = time.monotonic_ns()
+        now = MonotonicClock().now_ns()
+        assert before <= now <= time.monotonic_ns()
+
+    @pytest.mark.parametrize("wait_ns", [1, 999, 1_234_567, 20_000_000])
+    def test_a_sleep_is_over_when_its_time_has_come_and_no_sooner(self, wait_ns: int) -> None:
+        clock = MonotonicClock()
+        deadline_ns = clock.now_ns() + wait_ns
+        clock.sleep_until_ns(deadline_ns)
+        assert clock.now_ns() >= deadline_ns
+
+    @pytest.mark.parametrize("t_ns", [-1, 0, 1])
+    def test_what_has_passed_is_not_waited_for(self, t_ns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        def refuse(_: float) -> None:
+            raise AssertionError("slept")
+
+        monkeypatch.setattr(time, "sleep", refuse)
+        MonotonicClock().sleep_until_ns(t_ns)
+
+
+class TestVirtualClock:
+    def test_it_stands_still(self) -> None:
+        clock = VirtualClock(7)
+        assert [clock.now_ns() for _ in range(3)] == [7, 7, 7]
+        assert VirtualClock().now_ns() == 0
+
+    def test_sleeping_moves_it_and_never_back(self) -> None:
+        clock = VirtualClock(100)
+        clock.sleep_until_ns(250)
+        assert clock.now_ns() == 250
+        clock.sleep_until_ns(249)
+        assert clock.now_ns() == 250
+
+    def test_advancing_adds_up(self) -> None:
+        clock = VirtualClock(100)
+        clock.advance_ns(5)
+        clock.advance_ns(6)
+        assert clock.now_ns() == 111
+
+    @given(st.integers(0, 10**18), st.lists(st.tuples(st.booleans(), st.integers(0, 10**18))))
+    def test_it_is_to_the_nanosecond_at_any_time(self, start_ns: int, moves: list[tuple[bool, int]]) -> None:
+        clock, expected_ns = VirtualClock(start_ns), start_ns
+        for is_sleep, number_ns in moves:
+            if is_sleep:
+                clock.sleep_until_ns(number_ns)
+                expected_ns = max(expected_ns, number_ns)
+            else:
+                clock.advance_ns(number_ns)
+                expected_ns += number_ns
+            assert clock.now_ns() == expected_ns
+
+
+def test_unix_time_is_in_whole_microseconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(time, "time_ns", lambda: 1_700_000_000_123_456_999)
+    assert unix_time_us() == 1_700_000_000_123_456
+
+
+def test_a_stamp_is_a_date_a_time_and_a_name_that_any_file_system_takes() -> None:
+    stamp = local_stamp()
+    time.strptime(stamp, "%Y-%m-%dT%H-%M-%S")
+    assert len(stamp) == len("2026-11-22T14-05-09")
+    assert set(stamp) <= set("0123456789-T")

@@ -1,0 +1,171 @@
+"""What every process does alike: stop when asked, end with its parent, tell its status, sit on a core."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import bridge
+from bridge.process import StopFlag, end_with_parent, report_json, sit_on_core
+from protocol.errors import Interrupted
+
+ROOT = Path(str(bridge.__file__)).resolve().parent.parent
+PATIENCE_S = 60.0
+STOP_SIGNALS = [signal.SIGINT, signal.SIGTERM]
+on_linux = pytest.mark.skipif(sys.platform != "linux", reason="NOT TESTED: prctl and affinity are Linux's")
+
+
+def python(code: str) -> subprocess.Popen[str]:
+    """A Python process of its own that runs `code`."""
+    return subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+
+
+@pytest.fixture
+def stop() -> Iterator[StopFlag]:
+    """A flag that has taken both signals over; the handlers from before come back afterwards."""
+    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+    flag = StopFlag()
+    flag.install()
+    yield flag
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+class TestStopFlag:
+    def test_nobody_asked(self, stop: StopFlag) -> None:
+        assert not stop.requested
+        stop.check()
+
+    @pytest.mark.parametrize("number", STOP_SIGNALS)
+    def test_a_signal_sets_it_and_the_next_look_ends_the_loop(self, stop: StopFlag, number: signal.Signals) -> None:
+        signal.raise_signal(number)
+        assert stop.requested
+        for _ in range(2):
+            with pytest.raises(Interrupted, match="interrupted"):
+                stop.check()
+
+    @pytest.mark.parametrize("number", STOP_SIGNALS)
+    def test_only_the_signal_that_came_acts_by_default_next_time(self, stop: StopFlag, number: signal.Signals) -> None:
+        signal.raise_signal(number)
+        (other,) = (one for one in STOP_SIGNALS if one is not number)
+        assert signal.getsignal(number) is signal.SIG_DFL
+        signal.raise_signal(other)  # would end this process, had it no handler
+        assert stop.requested
+
+    @pytest.mark.parametrize("number", STOP_SIGNALS)
+    def test_a_second_signal_ends_a_process_that_does_not_look(self, number: signal.Signals) -> None:
+        code = f"""
+import signal
+from bridge.process import StopFlag
+flag = StopFlag()
+flag.install()
+signal.raise_signal({number.value})
+print(flag.requested, flush=True)
+signal.raise_signal({number.value})
+print("alive")
+"""
+        with python(code) as process:
+            assert process.communicate(timeout=PATIENCE_S)[0] == "True\n"
+        assert process.returncode == -number
+
+
+class TestEndWithParent:
+    @on_linux
+    def test_a_child_is_told_when_its_parent_was_killed(self) -> None:
+        """Both hold the pipe, so its end is the end of both. Nobody asks the child but the system."""
+        child = """
+import os, signal
+from bridge.process import StopFlag, end_with_parent
+stop = StopFlag()
+stop.install()
+end_with_parent()
+signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+print(os.getpid(), flush=True)
+signal.sigtimedwait({signal.SIGTERM}, 300) or os._exit(1)
+signal.raise_signal(signal.SIGTERM)
+signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+print("asked to stop" if stop.requested else "not asked", flush=True)
+"""
+        parent = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
+        with python(parent) as process:
+            assert process.stdout is not None
+            child_pid = int(process.stdout.readline())
+            try:
+                process.kill()
+                said, _ = process.communicate(timeout=PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(child_pid, signal.SIGKILL)
+                pytest.fail("the child outlived its parent")
+        assert process.returncode == -signal.SIGKILL
+        assert said == "asked to stop\n"
+
+    def test_elsewhere_it_does_nothing(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def refuse(*_: object) -> None:
+            raise AssertionError("called")
+
+        monkeypatch.setattr(sys, "platform", "darwin")
+        monkeypatch.setattr(ctypes, "CDLL", refuse)
+        end_with_parent()
+
+
+@pytest.fixture
+def cores() -> Iterator[set[int]]:
+    """The cores of this process, given back afterwards."""
+    before = os.sched_getaffinity(0)
+    yield before
+    os.sched_setaffinity(0, before)
+
+
+class TestSitOnCore:
+    @on_linux
+    def test_it_sits_there(self, cores: set[int]) -> None:
+        sit_on_core(max(cores))
+        assert os.sched_getaffinity(0) == {max(cores)}
+
+    @on_linux
+    @pytest.mark.parametrize("core", [-1, 1_000_000, 10**12, 10**30])
+    def test_nonsense_leaves_the_process_where_it_is(self, cores: set[int], core: int) -> None:
+        sit_on_core(core)
+        assert os.sched_getaffinity(0) == cores
+
+    def test_a_system_without_the_call_is_left_alone(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.delattr(os, "sched_setaffinity", raising=False)
+        sit_on_core(0)
+
+
+class TestReportJson:
+    def test_one_object_a_line(self) -> None:
+        stream = io.StringIO()
+        report = report_json(stream)
+        events: list[dict[str, Any]] = [
+            {"event": "waiting", "link": "udpin://127.0.0.1:1"},
+            {"event": "odd", "text": 'two\nlines, "quotes", µ', "numbers": [1, 2.5, None], "bad": float("nan")},
+        ]
+        for event in events:
+            report(event)
+        lines = stream.getvalue().splitlines()
+        assert [json.loads(line) for line in lines] == [events[0], {**events[1], "bad": None}]
+
+    def test_a_parent_gets_each_line_at_once(self) -> None:
+        reading, writing = os.pipe()
+        with os.fdopen(reading) as parent, os.fdopen(writing, "w") as child:
+            report_json(child)({"event": "started"})
+            os.set_blocking(reading, False)  # a line still in a buffer is an error then, not a wait
+            assert json.loads(parent.readline()) == {"event": "started"}
