@@ -1,0 +1,222 @@
+"""The controller as a process: read, step, publish, keep time."""
+
+from __future__ import annotations
+
+import sys
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from bridge.clock import Clock, MonotonicClock
+from bridge.endpoint import VEHICLE, Endpoint
+from bridge.link import Link, open_link
+from bridge.process import Report, StopFlag
+from bridge.summary import make_folder, write_json
+from controller.actuation import HilActuation
+from controller.law import Law
+from controller.laws import make_law
+from controller.telemetry import HilTelemetry
+from controller.vehicle import Vehicle
+from protocol import mavlink_map
+from protocol.errors import FwavHilError, Interrupted, LinkClosedError, PeerLostError, PeerMissingError, UsageError
+from protocol.mavlink_codec import FrameReader, FrameWriter
+from protocol.messages import ActuatorCommand, PositionSample
+from protocol.scenario import Scenario
+from protocol.streams import HEARTBEAT_TIMEOUT_NS
+from protocol.tick_frames import CommandWriter, read_tick
+
+HELLO_PERIOD_S = 0.1
+LOOK_PERIOD_S = 0.1
+PATIENCE_PERIODS = 1.5
+"""In real time a sample that is this late counts as missing: the last command is then given again."""
+
+
+class ControllerOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """How the process runs. link: a URI, or `-` to read it from standard input once everything is ready."""
+
+    link: str
+    clock: str = "lockstep"
+    arm: bool = True
+    out: Path | None = None
+    wait_s: float = 30.0
+    spin_s: float = 0.0
+
+
+class Controller:
+    """One law in front of one link.
+
+    The law's period is the scenario's, whatever the emulator's is: periods without a sample are made up for, and a sample
+    that comes before its period is over is answered with the command that stands.
+
+    counters   late_samples  real time: periods in which no sample came in time
+    """
+
+    def __init__(
+        self, scenario: Scenario, law: Law, link: Link, options: ControllerOptions, clock: Clock, stop: StopFlag
+    ) -> None:
+        component = scenario.wire.emulator_component
+        self.law = law
+        self.state = law.start()
+        self.stop = stop
+        self.clock = clock
+        self.options = options
+        self.endpoint = Endpoint(link, *VEHICLE)
+        self.vehicle = Vehicle(self.endpoint, scenario.digest(), component, arm=options.arm)
+        self.telemetry = HilTelemetry(self.endpoint, component)
+        lockstep = options.clock == "lockstep"
+        self.actuation = HilActuation(self.endpoint, self.vehicle, law.output.scale, lockstep=lockstep)
+        self._patience_s = LOOK_PERIOD_S if lockstep else PATIENCE_PERIODS * scenario.period_ns * 1e-9
+        self._lockstep = lockstep
+        self._samples: deque[PositionSample] = deque()
+        self._silence_ns = 0
+        self._begun = False
+        self.counters = {"late_samples": 0}
+
+    def run(self) -> None:
+        """Meet the emulator, then answer every sample until it says that the run is over."""
+        self._meet()
+        while (sample := self._read()) or not self.vehicle.ended:
+            if sample is None or sample.t_ns == self.actuation.answered_ns:
+                self.actuation.repeat()
+                continue
+            armed = self.vehicle.armed
+            if not armed:
+                self.state = self.law.start()  # what a disarmed law remembers never acted
+            tau = self.law.step(self.state, sample.t_ns, sample.q)
+            self.actuation.publish(ActuatorCommand(sample.t_ns, tau, armed), self.state.desired)
+
+    def _meet(self) -> None:
+        """Say hello until the first sample comes."""
+        for _ in range(max(1, round(self.options.wait_s / HELLO_PERIOD_S))):
+            self.stop.check()
+            self.endpoint.send(self.vehicle.hello())
+            self._look(HELLO_PERIOD_S)
+            if self._samples or self.vehicle.ended:
+                return
+        uri = self.endpoint.link.uri
+        if self.vehicle.agreed:
+            raise PeerMissingError(
+                f"the emulator at {uri} sent no tick within {self.options.wait_s:g} s: arm this controller with --arm"
+            )
+        raise PeerMissingError(
+            f"no emulator at {uri} within {self.options.wait_s:g} s: start one with `fwav-hil emulator SCENARIO "
+            f"--link {uri.replace('out://', 'in://', 1)}`, or wait longer with --wait"
+        )
+
+    def _read(self) -> PositionSample | None:
+        """The next sample; None where the run is over or, in real time, where none came in time."""
+        while not self._samples and not self.vehicle.ended:
+            self.stop.check()
+            begun_ns = self.clock.now_ns()
+            if self._look(self._patience_s):
+                self._silence_ns = 0
+                continue
+            # Waits are added up one by one: a stall of the whole machine then counts as one wait, not as silence.
+            self._silence_ns += min(self.clock.now_ns() - begun_ns, round(2e9 * self._patience_s))
+            if self._silence_ns > HEARTBEAT_TIMEOUT_NS:
+                raise PeerLostError(
+                    f"the emulator at {self.endpoint.link.uri} fell silent for 3 s after t = "
+                    f"{self.actuation.answered_ns * 1e-9:.3f} s: see whether it still runs"
+                )
+            if not self._lockstep:
+                self.counters["late_samples"] += 1
+                return None
+        return self._samples.popleft() if self._samples else None
+
+    def _look(self, timeout_s: float) -> bool:
+        """Take what comes within the timeout; whether anything came."""
+        try:
+            data = self.endpoint.link.recv(timeout_s)
+        except LinkClosedError:
+            if self.actuation.answered_ns < 0:
+                raise
+            raise PeerLostError(
+                f"the emulator at {self.endpoint.link.uri} closed the link in the middle of the run: see why it ended"
+            ) from None
+        if not data:
+            return False
+        sample = self.telemetry.take_datagram(data) if self._begun else None
+        if sample:
+            self._samples.append(sample)
+            return True
+        for frame in self.endpoint.reader.read(data):
+            if self.telemetry.is_telemetry(frame):
+                sample = self.telemetry.take(frame)
+                if sample is not None:
+                    if not self._begun:
+                        self._begun = True
+                        self.endpoint.reader.restart_sequences([(frame.system, frame.component, frame.sequence + 1)])
+                    self._samples.append(sample)
+            else:
+                self.vehicle.take(frame)
+        return True
+
+    def summary(self) -> dict[str, int]:
+        """Everything counted at this end, by name."""
+        return {
+            **self.endpoint.counters(),
+            **self.telemetry.counters,
+            **self.actuation.counters,
+            **self.law.counts(self.state),
+            **self.counters,
+        }
+
+
+def warm_up(law: Law) -> None:
+    """Have every kernel of the loop compiled (or loaded) before the emulator waits for an answer."""
+    mavlink_map.decode_pose(mavlink_map.encode_pose(0, np.zeros(6)))
+    mavlink_map.encode_attitude_target(0, np.zeros(6))
+    state = law.start()
+    command = ActuatorCommand(0, law.step(state, 0, np.zeros(6)), armed=True)
+    CommandWriter(FrameWriter(*VEHICLE), law.output.scale, lockstep=True).frame(command)
+    read_tick(b"", VEHICLE, FrameReader(is_datagram=True))
+
+
+def run_controller(scenario: Scenario, options: ControllerOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
+    """Build the scenario's law, open the link and `serve`.
+
+    Raises the errors of `protocol.errors`; a law that needs velocities is refused.
+    """
+    law = make_law(scenario.law, scenario)
+    if law.needs_velocity:
+        raise UsageError(law.velocity_sentence())
+    warm_up(law)
+    uri = _told_link() if options.link == "-" else options.link
+    report({"event": "waiting", "link": uri})
+    with open_link(uri, connect_timeout_s=options.wait_s) as link:
+        link.spin_s = options.spin_s
+        return serve(scenario, law, link, options, report, stop)
+
+
+def _told_link() -> str:
+    """The URI on the first line of standard input. Raises Interrupted where it ends without one."""
+    uri = sys.stdin.readline().strip()
+    if not uri:
+        raise Interrupted("interrupted before a link was named on standard input")
+    return uri
+
+
+def serve(
+    scenario: Scenario, law: Law, link: Link, options: ControllerOptions, report: Report, stop: StopFlag
+) -> dict[str, Any]:
+    """Run a law in front of whatever emulator is at the link; returns the summary of this end.
+
+    Raises the errors of `protocol.errors`, after the summary is written.
+    """
+    controller = Controller(scenario, law, link, options, MonotonicClock(), stop)
+    error: FwavHilError | None = None
+    try:
+        controller.run()
+    except FwavHilError as stopped:
+        error = stopped
+    summary = {"law": law.name, "counters": controller.summary(), "error": str(error) if error else None}
+    if options.out:
+        make_folder(options.out)
+        write_json(options.out / "controller.json", summary)
+    report({"event": "ended", **summary})
+    if error:
+        raise error
+    return summary

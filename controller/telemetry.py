@@ -1,0 +1,66 @@
+"""Where positions come from: the emulator's HIL messages, as `PositionSample`.
+
+The only fields that reach a law are those of ATT_POS_MOCAP; of HIL_SENSOR the time is read, which makes it the tick.
+HIL_GPS, HIL_STATE_QUATERNION and ODOMETRY are not looked at.
+"""
+
+from __future__ import annotations
+
+from bridge.endpoint import VEHICLE, Endpoint
+from protocol import mavlink_map
+from protocol.mavlink_codec import Frame
+from protocol.messages import PositionSample
+from protocol.tick_frames import read_tick
+
+
+class HilTelemetry:
+    """Joins the pose and the tick of one time into a sample.
+
+    counters   unknown_sender     frames of these messages from somebody else than the emulator
+               bad_pose           poses with NaN, or a quaternion that is not unit
+               tick_without_pose  ticks whose pose was lost: no sample
+               backwards          ticks older than the newest one
+    """
+
+    def __init__(self, endpoint: Endpoint, emulator_component: int) -> None:
+        self._endpoint = endpoint
+        self._sender = (VEHICLE[0], emulator_component)
+        self._pose: PositionSample | None = None
+        self._newest_ns = -1
+        self.counters = {"unknown_sender": 0, "bad_pose": 0, "tick_without_pose": 0, "backwards": 0}
+
+    def take_datagram(self, data: bytes) -> PositionSample | None:
+        """The sample in a datagram of just a pose and its tick; None where it is anything else, with nothing counted."""
+        sample = read_tick(data, self._sender, self._endpoint.reader)
+        if sample is None or sample.t_ns < self._newest_ns:
+            return None
+        self._newest_ns = sample.t_ns
+        self._pose = sample
+        return sample
+
+    def is_telemetry(self, frame: Frame) -> bool:
+        """Whether a frame is one of the two messages read here."""
+        return frame.message_id in (mavlink_map.POSE.message_id, mavlink_map.TICK.message_id)
+
+    def take(self, frame: Frame) -> PositionSample | None:
+        """Take one frame; the sample where the frame completes one (again, where the tick was sent again)."""
+        if (frame.system, frame.component) != self._sender:
+            self.counters["unknown_sender"] += 1
+            return None
+        if frame.message_id == mavlink_map.POSE.message_id:
+            self._pose = mavlink_map.decode_pose(frame.payload)
+            if self._pose is None:
+                self.counters["bad_pose"] += 1
+            return None
+        if mavlink_map.tick_sensor_id(frame.payload) != 0:
+            return None
+        t_ns = mavlink_map.decode_tick_time_ns(frame.payload)
+        if t_ns < self._newest_ns:
+            self.counters["backwards"] += 1
+            return None
+        sample = self._pose
+        if sample is None or sample.t_ns != t_ns:
+            self.counters["tick_without_pose"] += 1
+            return None
+        self._newest_ns = t_ns
+        return sample
