@@ -1,0 +1,78 @@
+"""The command line of the emulator."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from bridge.command_line import (
+    DEFAULT_PORT,
+    begin_process,
+    chosen_scenario,
+    clock_option,
+    duration_option,
+    json_option,
+    options,
+    process_options,
+    rate_option,
+    scenario_argument,
+    seed_option,
+    wait_option,
+)
+from bridge.summary import show_json
+
+EXAMPLE = """
+\b
+Example:
+  fwav-hil emulator scenarios/flapper.toml --link udpin://127.0.0.1:14560 --out /tmp/run
+"""
+
+
+@click.command("emulator", epilog=EXAMPLE)
+@options(
+    scenario_argument,
+    click.option(
+        "--link", default=f"udpin://127.0.0.1:{DEFAULT_PORT}", show_default=True, metavar="URI",
+        help="Where the controller is: udpin://, udpout://, tcpin://, tcpout://, serial:///dev/x:baud.",
+    ),
+    clock_option,
+    click.option(
+        "--speed", type=click.FloatRange(min=0.001), metavar="X",
+        help="Pace lockstep to X times real time; without it, as fast as it goes.",
+    ),
+    rate_option,
+    duration_option,
+    seed_option,
+    wait_option,
+    click.option(
+        "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
+        help="Folder for the log, the ground truth and the counters.",
+    ),
+    json_option,
+    process_options,
+)  # fmt: skip
+def emulator(
+    scenario: str,
+    link: str,
+    clock: str,
+    speed: float | None,
+    rate: float | None,
+    duration: float | None,
+    seed: int | None,
+    wait_s: float,
+    out: Path | None,
+    json_path: Path | None,
+    status: str,
+    core: int | None,
+    spin_us: int,
+    with_parent: bool,
+) -> None:
+    """Run the plant emulator alone: it waits for a controller, then flies SCENARIO (a file or a name) with it."""
+    chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed)
+    report, stop = begin_process(status, core, with_parent=with_parent)
+    from plant_emulator.process import EmulatorOptions, run_emulator
+
+    run_options = EmulatorOptions(link=link, clock=clock, speed=speed, out=out, wait_s=wait_s, spin_s=spin_us * 1e-6)
+    summary = run_emulator(chosen, run_options, report, stop)
+    show_json(json_path, {"scenario": chosen.name, "rate_hz": chosen.rate_hz, "seed": chosen.seed, **summary})

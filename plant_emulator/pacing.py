@@ -1,0 +1,236 @@
+"""How time is kept between the emulator and a controller: in lockstep, or in real time.
+
+A pacing carries one tick across the link and gives the plant the commands that came of it.
+"""
+
+from __future__ import annotations
+
+import abc
+
+from bridge.clock import Clock, unix_time_us
+from bridge.endpoint import VEHICLE, Endpoint
+from bridge.process import StopFlag
+from bridge.rate import RateKeeper
+from plant_emulator.emulator import Emulator
+from protocol import mavlink_map
+from protocol.errors import PeerLostError
+from protocol.mavlink_codec import Frame
+from protocol.messages import ActuatorCommand
+from protocol.streams import HEARTBEAT_TIMEOUT_NS
+from protocol.tlog import TlogWriter
+
+RESEND_AFTER_S = (0.010, 0.020, 0.040, 0.080, 0.160, 0.320, 0.640, 0.730)
+"""Waits of the exact profile: after each the tick is sent again; after the last, 2 s in all, the run ends."""
+
+
+class Pacing(abc.ABC):
+    """Carries ticks across the link.
+
+    counters        of the pacing, by name
+    latencies_ns    for each command, wall time from the sending of its sample to the command's arrival
+    """
+
+    def __init__(
+        self, emulator: Emulator, endpoint: Endpoint, log: TlogWriter | None, clock: Clock, stop: StopFlag
+    ) -> None:
+        self.emulator = emulator
+        self.endpoint = endpoint
+        self.log = log
+        self.clock = clock
+        self.stop = stop
+        self.latencies_ns: list[int] = []
+        self.counters: dict[str, int] = {}
+        self._owed: list[tuple[int, list[bytes]]] = []
+
+    @abc.abstractmethod
+    def exchange(self, tick: int, t_ns: int) -> None:
+        """Send the tick at simulation time t_ns and hand what comes of it to the emulator.
+
+        Raises PeerLostError where the controller fell silent, Interrupted where the user asked to stop.
+        """
+
+    def owe_log(self, t_us: int, frames: list[bytes]) -> None:
+        """Have frames logged under one time, at the next `settle_log`."""
+        self._owed.append((t_us, frames))
+
+    def settle_log(self) -> None:
+        """Write what is owed to the log: done while the other end is at work, and at the end of the run."""
+        if self.log:
+            write = self.log.write
+            for t_us, frames in self._owed:
+                for frame in frames:
+                    write(t_us, frame)
+        self._owed.clear()
+
+
+class Lockstep(Pacing):
+    """Simulation time stands still until the answer to the tick is there: the `exact` profile.
+
+    No answer: the same bytes again after 10, 20, 40 ms ..., and after 2 s a named error. It never steps on without an
+    answer, so stalls of the machine change nothing in the result. Every stamp in the log is simulation time.
+
+    counters   resent   ticks sent again              foreign  frames that belong to no answer: strays, late copies
+    """
+
+    def __init__(
+        self,
+        emulator: Emulator,
+        endpoint: Endpoint,
+        log: TlogWriter | None,
+        clock: Clock,
+        stop: StopFlag,
+        *,
+        delay_ns: int,
+        keeper: RateKeeper | None,
+    ) -> None:
+        super().__init__(emulator, endpoint, log, clock, stop)
+        self._delay_ns = delay_ns
+        self._keeper = keeper
+        self.counters = {"resent": 0, "foreign": 0}
+
+    def exchange(self, tick: int, t_ns: int) -> None:
+        """One tick out, its one answer back."""
+        self.stop.check()
+        if self._keeper:
+            self._keeper.sleep()
+            self._keeper.tick()
+        frames = self.emulator.sense(t_ns)
+        datagram = b"".join(frames)
+        t_us = t_ns // 1000
+        self.owe_log(t_us, frames)
+        sent_ns = self.clock.now_ns()
+        received: list[Frame] = []
+        for attempt, wait_s in enumerate(RESEND_AFTER_S):
+            if attempt:
+                self.counters["resent"] += 1
+                self.stop.check()
+            self.endpoint.link.send(datagram)
+            self.settle_log()
+            command = self._await_answer(t_ns, wait_s, received)
+            if command is not None:
+                self.latencies_ns.append(self.clock.now_ns() - sent_ns)
+                self._accept(tick, t_us, received)
+                self.emulator.act(t_ns, self._delay_ns, command)
+                return
+        raise PeerLostError(
+            f"the controller at {self.endpoint.link.peer} gave no answer to the tick at t = {t_ns * 1e-9:.3f} s for 2 s: "
+            "see whether it still runs"
+        )
+
+    def _await_answer(self, t_ns: int, wait_s: float, received: list[Frame]) -> ActuatorCommand | None:
+        """The command that answers the tick, None where it did not come in time; `received` gathers its frames."""
+        deadline_ns = 0
+        timeout_s = wait_s
+        while True:
+            data = self.endpoint.link.recv(timeout_s)
+            if data and not received and (command := self.emulator.decode_answer(data, t_ns)):
+                received.append(Frame(mavlink_map.COMMAND.message_id, data[4], *VEHICLE, b"", data))
+                return command
+            frames = self.endpoint.reader.read(data) if data else []
+            for frame in frames:
+                received.append(frame)
+                if frame.message_id != mavlink_map.COMMAND.message_id or (frame.system, frame.component) != VEHICLE:
+                    continue
+                command = self.emulator.decode(frame.payload)
+                if command is not None and command.t_ns == t_ns:
+                    return command
+                # A late copy of an earlier answer: neither it nor what came with it belongs to this tick.
+                self.counters["foreign"] += len(received)
+                received.clear()
+            if not frames and timeout_s == 0.0:
+                return None
+            now_ns = self.clock.now_ns()
+            deadline_ns = deadline_ns or now_ns + (0 if not frames else round(wait_s * 1e9))
+            timeout_s = max(0.0, (deadline_ns - now_ns) * 1e-9)  # at 0 one last look: the machine may have stalled
+
+    def _accept(self, tick: int, t_us: int, frames: list[Frame]) -> None:
+        """Log the frames of an answer. Numbers restart at t = 0, so the first answer's own tells how many belong to it."""
+        if tick == 0:
+            belonging = frames[-(frames[-1].sequence + 1) :]
+            self.counters["foreign"] += len(frames) - len(belonging)
+            frames = belonging
+            self.endpoint.reader.restart_sequences([(*VEHICLE, frames[-1].sequence + 1)])
+        self.owe_log(t_us, [frame.raw for frame in frames])
+
+
+class RealTime(Pacing):
+    """Simulation time is wall time: ticks on an absolute schedule, commands act the moment they arrive.
+
+    Late ticks are counted and never caught up in a burst; the link itself is the delay.
+
+    counters   late, slipped    of the schedule (`RateKeeper`)
+               unanswered       ticks whose command had not come when the next one was due
+               old_commands     commands older than one that came before, dropped
+    """
+
+    def __init__(
+        self,
+        emulator: Emulator,
+        endpoint: Endpoint,
+        log: TlogWriter | None,
+        clock: Clock,
+        stop: StopFlag,
+        *,
+        period_ns: int,
+    ) -> None:
+        super().__init__(emulator, endpoint, log, clock, stop)
+        self._keeper = RateKeeper(clock, period_ns)
+        self._period_ns = period_ns
+        self._sent: dict[int, int] = {}
+        self._newest_ns = -1
+        self._begun = False
+        self._heard_ns = clock.now_ns()
+        self.counters = {**self._keeper.counters, "unanswered": 0, "old_commands": 0}
+
+    def exchange(self, tick: int, t_ns: int) -> None:
+        """Send the tick, then take commands until the next one is due."""
+        self.stop.check()
+        if tick == 0:
+            self._keeper.start()
+        frames = self.emulator.sense(t_ns)
+        begun_ns = self.clock.now_ns()
+        self.endpoint.send(frames)
+        self.owe_log(unix_time_us(), frames)
+        self.settle_log()
+        self._sent[t_ns] = begun_ns
+        deadline_ns = self._keeper.deadline_ns
+        while (remaining_ns := deadline_ns - self.clock.now_ns()) > 0:
+            received = self.endpoint.receive(remaining_ns * 1e-9)
+            arrived_ns = self.clock.now_ns()
+            for frame in received:
+                since_tick_ns = min(max(0, arrived_ns - begun_ns), self._period_ns)
+                self._take(frame, t_ns + since_tick_ns, arrived_ns)
+        self._keeper.tick()
+        self.counters.update(self._keeper.counters)
+        if self._newest_ns < t_ns:
+            self.counters["unanswered"] += 1
+        self.emulator.check_staleness(t_ns + self._period_ns)
+        if self.clock.now_ns() - self._heard_ns > HEARTBEAT_TIMEOUT_NS:
+            raise PeerLostError(
+                f"the controller at {self.endpoint.link.peer} fell silent at t = {t_ns * 1e-9:.3f} s, 3 s without a "
+                "heartbeat or command: see whether it still runs"
+            )
+
+    def _take(self, frame: Frame, arrival_ns: int, wall_ns: int) -> None:
+        self.owe_log(unix_time_us(), [frame.raw])
+        if (frame.system, frame.component) != VEHICLE:
+            return
+        self._heard_ns = wall_ns
+        if frame.message_id != mavlink_map.COMMAND.message_id:
+            return
+        if not self._begun:
+            self._begun = True
+            self.endpoint.reader.restart_sequences([(*VEHICLE, frame.sequence + 1)])
+        command = self.emulator.decode(frame.payload)
+        if command is None:
+            return
+        if command.t_ns < self._newest_ns:
+            self.counters["old_commands"] += 1
+            return
+        if command.t_ns > self._newest_ns:
+            self._newest_ns = command.t_ns
+            sent_ns = self._sent.get(command.t_ns)
+            if sent_ns is not None:
+                self.latencies_ns.append(wall_ns - sent_ns)
+            self._sent = {t_ns: sent for t_ns, sent in self._sent.items() if t_ns > command.t_ns}
+        self.emulator.act(arrival_ns, 0, command)

@@ -1,0 +1,212 @@
+"""The emulator as a process: meet the controller, run the ticks, end cleanly, say what happened."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from bridge.clock import Clock, MonotonicClock
+from bridge.endpoint import VEHICLE, Endpoint, refuse_other_scenario
+from bridge.link import Link, open_link
+from bridge.memory import memory_pair
+from bridge.process import Report, StopFlag
+from bridge.rate import RateKeeper
+from bridge.summary import make_folder, percentiles_us, write_json
+from plant_emulator.emulator import Emulator
+from plant_emulator.pacing import Lockstep, Pacing, RealTime
+from plant_emulator.truth import TruthWriter
+from protocol import mavlink_map
+from protocol.errors import FwavHilError, PeerMissingError, RunFolderError
+from protocol.messages import ActuatorCommand
+from protocol.scenario import NANOSECONDS, Scenario
+from protocol.tlog import TlogWriter
+
+HELLO_PERIOD_S = 0.1
+PROGRESS_PERIOD_NS = 100_000_000
+FAREWELLS = 3
+"""Times the end is said, since a datagram may be lost."""
+
+
+class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """How the process runs.
+
+    speed: lockstep paced to that multiple of real time (None: as fast as it goes). spin_s: see `Link.spin_s`.
+    """
+
+    link: str
+    clock: str = "lockstep"
+    speed: float | None = None
+    out: Path | None = None
+    wait_s: float = 30.0
+    spin_s: float = 0.0
+
+
+def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
+    """Open the link and `fly`. Raises the errors of `protocol.errors`."""
+    warm_up(scenario)
+    with open_link(options.link, connect_timeout_s=options.wait_s) as link:
+        link.spin_s = options.spin_s
+        return fly(scenario, link, options, report, stop)
+
+
+def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
+    """Run a scenario against whatever controller comes to the link; returns the summary of this end.
+
+    The log, the ground truth and this summary (in `options.out`) are complete up to the end, whatever that end is. Raises
+    the errors of `protocol.errors`.
+    """
+    log = truth = None
+    try:
+        if options.out:
+            make_folder(options.out)
+            (options.out / "scenario.toml").write_text(scenario.to_toml(), encoding="utf-8")
+            log, truth = TlogWriter(options.out / "run.tlog"), TruthWriter(options.out / "ground_truth.npy")
+        endpoint = Endpoint(link, VEHICLE[0], scenario.wire.emulator_component)
+        emulator = Emulator(scenario, endpoint, truth)
+        pacing = _pacing(scenario, options, emulator, endpoint, log, MonotonicClock(), stop)
+        report({"event": "waiting", "link": link.uri})
+        _meet_controller(scenario, options, endpoint, stop)
+        report({"event": "started", "peer": link.peer})
+        return _run_ticks(scenario, emulator, pacing, options.out, report)
+    finally:
+        _close_files(log, truth)
+
+
+def warm_up(scenario: Scenario) -> None:
+    """Have every kernel of a run compiled (or loaded) before a controller waits for an answer."""
+    near, far = memory_pair()
+    with near, far:
+        emulator = Emulator(scenario, Endpoint(near, *VEHICLE), None)
+        emulator.sense(0)
+        command = ActuatorCommand(0, np.zeros(6), armed=True)
+        emulator.decode(mavlink_map.encode_command(command, np.ones(6), lockstep=True))
+        emulator.act(0, 0, command)
+        emulator.advance(scenario.period_ns)
+        emulator.decode_answer(b"", 0)
+
+
+def _pacing(
+    scenario: Scenario,
+    options: EmulatorOptions,
+    emulator: Emulator,
+    endpoint: Endpoint,
+    log: TlogWriter | None,
+    clock: Clock,
+    stop: StopFlag,
+) -> Pacing:
+    if options.clock == "realtime":
+        return RealTime(emulator, endpoint, log, clock, stop, period_ns=scenario.period_ns)
+    keeper = RateKeeper(clock, round(scenario.period_ns / options.speed)) if options.speed else None
+    return Lockstep(emulator, endpoint, log, clock, stop, delay_ns=scenario.delay_ns, keeper=keeper)
+
+
+def _meet_controller(scenario: Scenario, options: EmulatorOptions, endpoint: Endpoint, stop: StopFlag) -> None:
+    """Hold the plant at t = 0 until a controller with the same scenario says it is armed."""
+    digest = scenario.digest()
+    agreed = heard = False
+    for _ in range(max(1, round(options.wait_s / HELLO_PERIOD_S))):
+        stop.check()
+        hello = [
+            endpoint.seal(mavlink_map.HEARTBEAT, mavlink_map.encode_emulator_heartbeat()),
+            endpoint.seal(mavlink_map.VERSION, mavlink_map.encode_version(digest)),
+        ]
+        if heard:
+            endpoint.send(hello)
+        for frame in endpoint.receive(HELLO_PERIOD_S):
+            if (frame.system, frame.component) != VEHICLE:
+                continue
+            if not heard:
+                endpoint.send(hello)
+            heard = True
+            if frame.message_id == mavlink_map.VERSION.message_id:
+                refuse_other_scenario("controller", mavlink_map.decode_version(frame.payload), digest)
+                agreed = True
+            elif (
+                frame.message_id == mavlink_map.HEARTBEAT.message_id
+                and agreed
+                and mavlink_map.heartbeat_is_armed(frame.payload)
+            ):
+                endpoint.writer.sequence = 0  # the numbers of the run, and so its log, begin with the first tick
+                return
+    uri = endpoint.link.uri
+    if heard:
+        raise PeerMissingError(
+            f"the controller at {endpoint.link.peer} did not arm within {options.wait_s:g} s: start it with --arm, "
+            "or arm it from a ground station (MAV_CMD_COMPONENT_ARM_DISARM)"
+        )
+    raise PeerMissingError(
+        f"no controller came to {uri} within {options.wait_s:g} s: start one with `fwav-hil controller "
+        f"SCENARIO --link {uri.replace('in://', 'out://', 1)}`, or wait longer with --wait"
+    )
+
+
+def _run_ticks(
+    scenario: Scenario, emulator: Emulator, pacing: Pacing, out: Path | None, report: Report
+) -> dict[str, Any]:
+    period_ns, clock = scenario.period_ns, pacing.clock
+    begun_ns = clock.now_ns()
+    next_progress_ns = last_ns = begun_ns
+    ticks_ns: list[int] = []
+    done = 0
+    error: FwavHilError | None = None
+    try:
+        for tick in range(scenario.ticks):
+            t_ns = tick * period_ns
+            pacing.exchange(tick, t_ns)
+            emulator.advance(t_ns + period_ns)
+            done = tick + 1
+            now_ns = clock.now_ns()
+            ticks_ns.append(now_ns - last_ns)
+            last_ns = now_ns
+            if now_ns >= next_progress_ns:
+                next_progress_ns = now_ns + PROGRESS_PERIOD_NS
+                report({"event": "progress", "t_ns": t_ns + period_ns, "q": emulator.plant.state.motion[:6].tolist()})
+    except FwavHilError as stopped:
+        error = stopped
+    wall_ns = clock.now_ns() - begun_ns
+    _say_farewell(emulator, pacing, done * period_ns)
+    summary = {
+        "clock": "realtime" if isinstance(pacing, RealTime) else "lockstep",
+        "ticks": done,
+        "wall_s": wall_ns / NANOSECONDS,
+        "latency_us": percentiles_us(pacing.latencies_ns),
+        "tick_us": percentiles_us(ticks_ns),
+        "counters": {**emulator.all_counters(), **pacing.counters},
+        "error": str(error) if error else None,
+    }
+    if out:
+        write_json(out / "emulator.json", summary)
+    report({"event": "ended", **summary})
+    if error:
+        raise error
+    return summary
+
+
+def _say_farewell(emulator: Emulator, pacing: Pacing, t_ns: int) -> None:
+    """Tell the controller that the run is over, and log it once."""
+    payload = mavlink_map.encode_emulator_heartbeat(ending=True)
+    frames = [pacing.endpoint.seal(mavlink_map.HEARTBEAT, payload) for _ in range(FAREWELLS)]
+    try:
+        for frame in frames:
+            pacing.endpoint.send([frame])
+    except FwavHilError:
+        pass  # the link may be what ended the run
+    if isinstance(pacing, Lockstep):
+        pacing.owe_log(t_ns // 1000, frames[:1])
+    pacing.settle_log()
+
+
+def _close_files(log: TlogWriter | None, truth: TruthWriter | None) -> None:
+    """Close both files, the second one even where the first cannot be written."""
+    problem: RunFolderError | None = None
+    for file in (log, truth):
+        try:
+            if file:
+                file.close()
+        except RunFolderError as error:
+            problem = error
+    if problem:
+        raise problem

@@ -1,0 +1,117 @@
+"""Ground truth on disk: one row a tick, in a NumPy file that grows and can be read at any moment.
+
+`numpy.load("ground_truth.npy")` gives a structured array. It holds velocities, so it goes to disk and never to a controller.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+import numpy.typing as npt
+
+from protocol.errors import RunFolderError
+from protocol.messages import FloatArray
+
+ROW = np.dtype(
+    [
+        ("t_ns", "<i8"),
+        ("q", "<f8", 6),
+        ("q_dot", "<f8", 6),
+        ("command", "<f8", 6),
+        ("tau", "<f8", 6),
+        ("u", "<f8", 6),
+    ]
+)
+"""t_k (ns); true position, attitude and their rates at t_k; the newest command; tau acting at the motors; u after the gears."""
+
+_BLOCK = 1024
+
+
+class TruthWriter:
+    """Appends rows; the file's header is rewritten at each flush, so the file is whole up to the last one."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._block = np.zeros(_BLOCK, dtype=ROW)
+        self._numbers: FloatArray = self._block.view("<f8").reshape(_BLOCK, -1)
+        self._times = self._block["t_ns"]
+        self._pending = 0
+        self._count = 0
+        try:
+            self._file = path.open("wb", buffering=0)
+        except OSError as error:
+            raise RunFolderError(f"cannot write the ground truth {path}: {error.strerror}") from None
+        try:
+            self._write(_header(0))
+        except OSError as error:
+            self._file.close()
+            raise RunFolderError(f"cannot write the ground truth {path}: {error.strerror}") from None
+
+    def next_row(self, t_ns: int) -> FloatArray:
+        """The numbers (31,) of a new row at time t_ns, for the caller to fill from its second on; see `integrate.fill_row`.
+
+        The row is on its way to disk from the next call, or a flush, on.
+        """
+        if self._pending == _BLOCK:
+            self.flush()
+        row = self._numbers[self._pending]
+        self._times[self._pending] = t_ns
+        self._pending += 1
+        return np.asarray(row)
+
+    def flush(self) -> None:
+        """Write what is pending and make the header say so."""
+        if not self._pending:
+            return
+        try:
+            self._file.seek(len(_header(0)) + self._count * ROW.itemsize)  # a failed flush may have left a part behind
+            self._write(self._block[: self._pending].tobytes())
+            self._count += self._pending
+            self._pending = 0
+            self._file.seek(0)
+            self._write(_header(self._count))
+        except OSError as error:
+            raise RunFolderError(f"cannot write the ground truth {self.path}: {error.strerror}") from None
+
+    def _write(self, data: bytes) -> None:
+        """Write all of it: one unbuffered write may stop short, as on a disk that is nearly full."""
+        rest = memoryview(data)
+        while rest:
+            rest = rest[self._file.write(rest) :]
+
+    def close(self) -> None:
+        """Flush and close; may be called again."""
+        if not self._file.closed:
+            try:
+                self.flush()
+            finally:
+                self._file.close()
+
+    def __enter__(self) -> TruthWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _header(count: int) -> bytes:
+    """A NumPy header for `count` rows, of the same length for every count."""
+    buffer = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        buffer, {"descr": np.lib.format.dtype_to_descr(ROW), "fortran_order": False, "shape": (count,)}
+    )
+    return buffer.getvalue()
+
+
+def load_truth(path: Path) -> npt.NDArray[np.void]:
+    """The rows of a ground truth file. Raises RunFolderError where there is none."""
+    try:
+        rows: npt.NDArray[np.void] = np.load(path)
+    except (OSError, EOFError, ValueError) as error:
+        raise RunFolderError(f"cannot read the ground truth {path}: {error}") from None
+    return rows
