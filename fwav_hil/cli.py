@@ -1,0 +1,226 @@
+"""The command line: every command of the project under one name. Modules load when a command runs, not for --help."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import click
+
+from bridge.command_line import (
+    DEFAULT_PORT,
+    chosen_scenario,
+    clock_option,
+    duration_option,
+    json_option,
+    law_option,
+    options,
+    rate_option,
+    scenario_argument,
+    seed_option,
+    wait_option,
+)
+from bridge.summary import is_stdout, show_json
+from fwav_hil import __version__
+
+COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "run": ("fwav_hil.cli:run_command", "Fly a scenario: emulator and controller as two processes on a link."),
+        "simulate": ("fwav_hil.cli:simulate_command", "Fly a scenario in this process, without a link."),
+        "emulator": ("plant_emulator.command:emulator", "Run the plant emulator alone."),
+        "controller": ("controller.command:controller", "Run the controller alone."),
+        "report": ("fwav_hil.cli:report_command", "Score and plot a run folder again."),
+    }
+)
+
+EXAMPLE = """
+\b
+Example:
+  fwav-hil run                                 the default scenario, 10 s
+  fwav-hil run paper --law pd --json pd.json
+  fwav-hil simulate flapper --seeds 20
+"""
+
+
+class _LazyGroup(click.Group):
+    """A group whose commands are imported when they are called; their help lines stand in the table above."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, name = COMMANDS[cmd_name][0].partition(":")
+        command: click.Command = getattr(importlib.import_module(module), name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
+
+
+@click.group("fwav-hil", cls=_LazyGroup, epilog=EXAMPLE)
+@click.version_option(__version__, package_name="fwav-hil", prog_name="fwav-hil")
+def cli() -> None:
+    """Hardware-in-the-loop MAVLink bridge and flight controller for a flapping-wing aerial vehicle.
+
+    SCENARIO is a file, or the name of one that comes with the project: flapper, paper, paper_disturbed.
+
+    \b
+    Exit codes: 0 done, 2 wrong argument or scenario, 3 link, 4 the other end, 5 the flight diverged, 6 results cannot
+    be written, 130 interrupted.
+    """
+
+
+out_option = click.option(
+    "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
+    help="Folder of the run; by default a new one in runs/.",
+)  # fmt: skip
+plots_option = click.option("--plots/--no-plots", default=True, show_default=True, help="Draw the plots (PNG).")
+
+
+@click.command(
+    "run", epilog="\b\nExample:\n  fwav-hil run scenarios/flapper.toml --law ude --clock lockstep --json result.json"
+)
+@options(
+    scenario_argument,
+    law_option,
+    clock_option,
+    click.option(
+        "--speed", type=click.FloatRange(min=0.001), metavar="X", help="Pace lockstep to X times real time.",
+    ),
+    rate_option,
+    duration_option,
+    seed_option,
+    click.option(
+        "--link", default=f"udpin://127.0.0.1:{DEFAULT_PORT}", show_default=True, metavar="URI",
+        help="The emulator's end of the link: udpin:// or tcpin://; port 0 takes a free one.",
+    ),
+    wait_option,
+    out_option,
+    plots_option,
+    json_option,
+)  # fmt: skip
+def run_command(
+    scenario: str,
+    law: str | None,
+    clock: str,
+    speed: float | None,
+    rate: float | None,
+    duration: float | None,
+    seed: int | None,
+    link: str,
+    wait_s: float,
+    out: Path | None,
+    plots: bool,
+    json_path: Path | None,
+) -> None:
+    """Fly SCENARIO with the emulator and the controller as two processes that speak MAVLink over a link."""
+    chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
+    from controller.laws import make_law
+    from fwav_hil.compile import compile_kernels
+    from fwav_hil.run import RunOptions, new_folder, run
+    from protocol.errors import UsageError
+
+    chosen_law = make_law(chosen.law, chosen)
+    if chosen_law.needs_velocity:
+        raise UsageError(chosen_law.velocity_sentence())
+    compile_kernels(chosen)
+    folder = new_folder(chosen, out)
+    try:
+        run(chosen, folder, RunOptions(clock=clock, link=link, speed=speed, wait_s=wait_s))
+    finally:
+        _finish(folder, json_path, plots=plots)
+
+
+@click.command("simulate", epilog="\b\nExample:\n  fwav-hil simulate flapper --rate 500 --seeds 20 --json spread.json")
+@options(
+    scenario_argument,
+    law_option,
+    rate_option,
+    duration_option,
+    seed_option,
+    click.option(
+        "--seeds", type=click.IntRange(min=1), metavar="N", help="Fly N seeds from the first on and show the spread.",
+    ),
+    click.option(
+        "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
+        help="Folder for the ground truth, the summary and the plots; nothing is written without it.",
+    ),
+    plots_option,
+    json_option,
+)  # fmt: skip
+def simulate_command(
+    scenario: str,
+    law: str | None,
+    rate: float | None,
+    duration: float | None,
+    seed: int | None,
+    seeds: int | None,
+    out: Path | None,
+    plots: bool,
+    json_path: Path | None,
+) -> None:
+    """Fly SCENARIO in this process: the same laws, plant, sampling, delays and noise, compiled, without a link."""
+    chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
+    from fwav_hil.run import new_folder
+    from fwav_hil.simulated import simulate_run, simulate_spread
+    from fwav_hil.tables import print_spread, print_summary
+    from protocol.errors import DivergenceError
+
+    if seeds:
+        spread = simulate_spread(chosen, seeds)
+        print_spread(spread, to_stderr=is_stdout(json_path))
+        show_json(json_path, spread)
+        return
+    folder = new_folder(chosen, out) if out else None
+    summary = simulate_run(chosen, folder)
+    if folder:
+        _finish(folder, json_path, plots=plots)
+    else:
+        print_summary(summary, to_stderr=is_stdout(json_path))
+        show_json(json_path, summary)
+    if summary["error"]:
+        raise DivergenceError(summary["error"])
+
+
+@click.command("report", epilog="\b\nExample:\n  fwav-hil report runs/flapper-ude-2026-11-22T14-05-09")
+@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@plots_option
+@json_option
+def report_command(folder: Path, plots: bool, json_path: Path | None) -> None:
+    """Score and plot the run in FOLDER again, whatever became of the commands that flew it."""
+    from fwav_hil.report import summarise
+
+    summarise(folder)
+    _finish(folder, json_path, plots=plots)
+
+
+def _finish(folder: Path, json_path: Path | None, *, plots: bool) -> None:
+    """Draw, print and hand on what a run folder holds; says where it is even where it holds nothing yet."""
+    from bridge.summary import read_json, write_json
+    from fwav_hil.report import FILES
+    from fwav_hil.tables import print_summary
+
+    path = folder / FILES["summary"]
+    summary: dict[str, Any] = read_json(path)
+    if not summary:
+        click.echo(f"run folder: {folder} (no tick was flown)", err=is_stdout(json_path))
+        return
+    if plots:
+        from fwav_hil.plots import plot_run
+        from plant_emulator.truth import load_truth
+        from protocol.scenario import load_scenario
+
+        scenario = load_scenario(folder / FILES["scenario"])
+        title = f"{summary['scenario']}, {summary['law']}, {summary['rate_hz']:g} Hz"
+        drawn = plot_run(folder, scenario, load_truth(folder / FILES["ground_truth"]), title)
+        summary["files"] |= {name: str(file) for name, file in drawn.items()}
+        write_json(path, summary)
+    print_summary(summary, to_stderr=is_stdout(json_path))
+    click.echo(f"run folder: {folder}", err=is_stdout(json_path))
+    show_json(json_path, summary)

@@ -1,0 +1,64 @@
+"""How far a run is, while it runs: a bar on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import math
+import sys
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bar
+
+from bridge.clock import MonotonicClock
+
+_LINE_PERIOD_NS = 2_000_000_000
+
+
+class Progress:
+    """Shows elapsed time, simulation time, how fast it goes and the tracking error now, on standard error."""
+
+    def __init__(self, duration_s: float) -> None:
+        self._duration_s = duration_s
+        self._clock = MonotonicClock()
+        self._begun_ns = 0
+        self._line_ns = 0
+        self._bar: Bar | None = None
+        if sys.stderr.isatty():
+            self._bar = Bar(
+                TextColumn("flying"),
+                BarColumn(bar_width=24),
+                TextColumn("{task.description}"),
+                TimeElapsedColumn(),
+                console=Console(stderr=True),
+            )
+            self._task = self._bar.add_task("starting", total=duration_s)
+
+    def update(self, t_s: float, error: tuple[float, float]) -> None:
+        """Show that simulation time is at t_s, with the largest position (m) and attitude (rad) error now."""
+        now_ns = self._clock.now_ns()
+        if not self._begun_ns:
+            self._begun_ns, self._line_ns, self._first_s = now_ns, now_ns, t_s
+            return
+        speed = (t_s - self._first_s) / max(1e-9, (now_ns - self._begun_ns) * 1e-9)
+        text = (
+            f"t = {t_s:5.2f} of {self._duration_s:g} s, {speed:4.1f} x real time, "
+            f"error {1e3 * error[0]:.1f} mm, {math.degrees(error[1]):.2f} deg"
+        )
+        if self._bar:
+            self._bar.update(self._task, completed=t_s, description=text)
+        elif now_ns - self._line_ns > _LINE_PERIOD_NS:
+            self._line_ns = now_ns
+            sys.stderr.write(text + "\n")
+            sys.stderr.flush()
+
+    def __enter__(self) -> Progress:
+        if self._bar:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar:
+            self._bar.stop()

@@ -1,0 +1,78 @@
+"""The results of a run: from its folder to summary.json, plots and a table; it can be done again at any time.
+
+scenario.toml      the scenario in full           run.tlog            every frame, both directions
+ground_truth.npy   one row a tick                 emulator.json, controller.json   counters of each end
+summary.json       scores, latency, counters      *.png               plots
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bridge.summary import read_json, write_json
+from fwav_hil import __version__
+from fwav_hil.score import scores
+from plant_emulator.truth import load_truth
+from protocol.scenario import NANOSECONDS, Scenario, load_scenario
+
+FILES = {
+    "log": "run.tlog",
+    "ground_truth": "ground_truth.npy",
+    "scenario": "scenario.toml",
+    "emulator": "emulator.json",
+    "controller": "controller.json",
+    "summary": "summary.json",
+}
+_DROPPED = ("bad_crc", "truncated", "unknown_peer", "send_failed", "sequence_gaps")
+_REFUSED = ("refused_commands", "bad_pose", "unknown_sender", "backwards", "old_commands")
+
+
+def summarise(folder: Path, *, placement: str = "") -> dict[str, Any]:
+    """Score the run in `folder`, write summary.json there and return it. Raises RunFolderError, ScenarioError."""
+    scenario = load_scenario(folder / FILES["scenario"])
+    truth = load_truth(folder / FILES["ground_truth"])
+    emulator, controller = read_json(folder / FILES["emulator"]), read_json(folder / FILES["controller"])
+    wall_s = emulator.get("wall_s")
+    ends = {"emulator": emulator.get("counters", {}), "controller": controller.get("counters", {})}
+    summary = {
+        **head(scenario, truth),
+        "clock": emulator.get("clock"),
+        "ticks_per_s": len(truth) / wall_s if wall_s else None,
+        **scores(scenario, truth["t_ns"], truth["q"]),
+        "latency_us": emulator.get("latency_us", dict.fromkeys(("p50", "p99", "p999", "max"))),
+        "tick_us": emulator.get("tick_us"),
+        "counters": {
+            "missed": ends["controller"].get("missed_samples", 0) + ends["emulator"].get("unanswered", 0),
+            "late": ends["emulator"].get("late", 0) + ends["controller"].get("late_samples", 0),
+            "dropped": _total(ends, _DROPPED),
+            "refused": _total(ends, _REFUSED),
+            **ends,
+        },
+        "placement": placement,
+        "error": emulator.get("error") or controller.get("error"),
+        "files": {name: str(folder / file) for name, file in FILES.items() if (folder / file).exists()},
+    }
+    summary["files"]["summary"] = str(folder / FILES["summary"])
+    write_json(folder / FILES["summary"], summary)
+    return summary
+
+
+def head(scenario: Scenario, truth: npt.NDArray[np.void]) -> dict[str, Any]:
+    """The keys of a summary that say which run it was."""
+    return {
+        "scenario": scenario.name,
+        "law": scenario.law,
+        "rate_hz": scenario.rate_hz,
+        "seed": scenario.seed,
+        "duration_s": len(truth) * scenario.period_ns / NANOSECONDS,
+        "ticks": len(truth),
+        "version": __version__,
+    }
+
+
+def _total(ends: dict[str, dict[str, int]], names: tuple[str, ...]) -> int:
+    return sum(counters.get(name, 0) for counters in ends.values() for name in names)

@@ -1,0 +1,175 @@
+"""One run: emulator and controller as two processes on a link, watched to their end, and their results put together."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from bridge.clock import local_stamp
+from bridge.process import StopFlag
+from bridge.summary import make_folder
+from fwav_hil.children import Child, listen
+from fwav_hil.progress import Progress
+from fwav_hil.report import FILES, summarise
+from protocol.errors import FwavHilError, Interrupted, RunFolderError, UsageError
+from protocol.scenario import NANOSECONDS, Scenario
+
+_IN_TO_OUT = {"udpin": "udpout", "tcpin": "tcpout"}
+
+
+class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """How the run is made. link: the emulator's URI; the controller gets its counterpart."""
+
+    clock: str = "lockstep"
+    link: str = "udpin://127.0.0.1:14560"
+    speed: float | None = None
+    wait_s: float = 30.0
+
+
+class RunFailedError(FwavHilError):
+    """A process of the run failed; carries its exit code."""
+
+    def __init__(self, message: str, exit_code: int) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
+
+
+def new_folder(scenario: Scenario, out: Path | None) -> Path:
+    """The folder of a new run: `out`, or one named after the scenario and the time. Raises RunFolderError."""
+    folder = out or Path("runs") / f"{scenario.name}-{scenario.law}-{local_stamp()}"
+    if (folder / FILES["log"]).exists() or (folder / FILES["ground_truth"]).exists():
+        raise RunFolderError(
+            f"{folder} holds a run already, which stays: choose another folder with --out, or remove it"
+        )
+    make_folder(folder)
+    try:
+        (folder / FILES["scenario"]).write_text(scenario.to_toml(), encoding="utf-8")
+    except OSError as error:
+        raise RunFolderError(f"cannot write to {folder}: {error.strerror}; choose another folder with --out") from None
+    return folder
+
+
+class Placement(msgspec.Struct, frozen=True):
+    """Where the two processes of a run sit, and how they wait for each other.
+
+    In lockstep one process waits while the other works. Asleep on a core of its own it costs the wake-up of that core at
+    each hand-over; on a shared core it costs a switch of contexts, and cold caches; polling on a core of its own it costs
+    neither, only that core. So: two cores and a short spin where there are two, one core where not. In real time each
+    process sleeps, and the scheduler places it.
+    """
+
+    text: str
+    emulator: tuple[str, ...] = ()
+    controller: tuple[str, ...] = ()
+
+
+_PATIENCE = 10
+"""Looks, a tenth of a second apart or less, that a process gets to end by itself after the other one has failed."""
+
+SPIN_US = "500"
+"""How long a lockstep process polls before it sleeps: several ticks' worth; longer waits are stalls."""
+
+
+def choose_placement(clock: str) -> Placement:
+    """The placement for a clock mode on this machine."""
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    if clock == "lockstep" and len(cores) > 1:
+        spin = ("--spin-us", SPIN_US)
+        return Placement(
+            f"a core each (emulator {cores[-1]}, controller {cores[-2]}), polling up to {SPIN_US} us before sleeping",
+            ("--core", str(cores[-1]), *spin),
+            ("--core", str(cores[-2]), *spin),
+        )
+    if clock == "lockstep" and cores:
+        return Placement("both processes on the one core there is, sleeping while they wait")
+    return Placement("placed by the scheduler, sleeping while they wait")
+
+
+def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]:
+    """Run both processes; returns the summary, which is also in the folder. Raises RunFailedError, Interrupted, ...
+
+    Whatever happens the folder keeps what was recorded, no process stays behind, and the summary is written if there is
+    anything to sum up.
+    """
+    scheme, _, address = options.link.partition("://")
+    if scheme not in _IN_TO_OUT:
+        raise UsageError(
+            f"`run` needs a link on which the controller can come to the emulator, and {options.link} is none: use "
+            "udpin://host:port or tcpin://host:port, or start both ends by themselves"
+        )
+    stop = StopFlag()
+    stop.install()
+    placement = choose_placement(options.clock)
+    common = [
+        str(folder / FILES["scenario"]),
+        "--clock",
+        options.clock,
+        "--out",
+        str(folder),
+        "--wait",
+        str(options.wait_s),
+    ]
+    speed = ["--speed", str(options.speed)] if options.speed else []
+    emulator = Child("plant_emulator", [*common, *placement.emulator, "--link", f"{scheme}://{address}", *speed])
+    # The controller learns its link when the emulator has opened its own: were the port another run's, it must not go there.
+    controller = Child("controller", [*common, *placement.controller, "--link", "-", "--arm"])
+    try:
+        _watch(scenario, emulator, controller, stop)
+    finally:
+        for child in (emulator, controller):
+            child.end()
+    summary = summarise(folder, placement=placement.text) if _has_rows(folder) else {}
+    if stop.requested:
+        raise Interrupted(f"interrupted: what was recorded until then is in {folder}")
+    for child in _culprit_first(emulator, controller):
+        if child.failure:
+            raise RunFailedError(child.failure, child.process.returncode if child.process.returncode > 0 else 1)
+    return summary
+
+
+def _watch(scenario: Scenario, emulator: Child, controller: Child, stop: StopFlag) -> None:
+    """Hear both processes until both have ended, and show how the run goes."""
+    told = False
+    patience = _PATIENCE
+    with Progress(scenario.duration_s) as progress:
+        for child, event in listen([emulator, controller]):
+            kind = event.get("event")
+            if child is emulator and kind == "waiting":
+                told = True
+                scheme, _, address = event["link"].partition("://")
+                controller.tell(f"{_IN_TO_OUT[scheme]}://{address}")
+            elif child is emulator and kind == "progress":
+                progress.update(event["t_ns"] / NANOSECONDS, _error_now(scenario, event["t_ns"], event["q"]))
+            if stop.requested or any(one.process.poll() for one in (emulator, controller)):
+                # What still runs ends by itself in a moment, or is asked to; signals of a terminal went to all already.
+                patience -= 1
+                if patience == 0 or not told:
+                    emulator.ask_to_end()
+                    controller.ask_to_end()
+                elif patience < -_PATIENCE:
+                    return
+
+
+def _error_now(scenario: Scenario, t_ns: int, q: list[float]) -> tuple[float, float]:
+    """Largest position error (m) and attitude error (rad) at one time."""
+    from controller.reference import evaluate_reference, reference_parameters
+
+    desired = np.empty((3, 6))
+    evaluate_reference(t_ns * 1e-9, reference_parameters(scenario.reference), desired[0], desired[1], desired[2])
+    error = np.abs(np.array(q) - desired[0])
+    return float(error[:3].max()), float(error[3:].max())
+
+
+def _culprit_first(emulator: Child, controller: Child) -> tuple[Child, Child]:
+    """The process whose failure explains the other's: one that was killed, or else the emulator."""
+    killed = controller.process.returncode is not None and controller.process.returncode < 0
+    return (controller, emulator) if killed else (emulator, controller)
+
+
+def _has_rows(folder: Path) -> bool:
+    path = folder / FILES["ground_truth"]
+    return path.exists() and len(np.load(path, mmap_mode="r")) > 0

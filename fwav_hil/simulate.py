@@ -1,0 +1,115 @@
+"""The closed loop in one process, without a link: the same law, plant, sampling, noise, delays and wire mapping.
+
+A lockstep run of the two processes and this give the same numbers to the bit, since every kernel is shared and the order
+of a tick is the same: measure, as the wire carries it, law, safety envelope, command on its way, record, advance.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from controller.law import Law, control_step
+from controller.laws import make_law
+from plant_emulator.integrate import (
+    GOES_ON,
+    TOO_MANY_PENDING,
+    Plant,
+    advance,
+    apply_due_commands,
+    divergence_sentence,
+    push_command,
+)
+from plant_emulator.safety import clamp
+from plant_emulator.sensors import PositionSensor, add_noise
+from protocol.compiled import Packed, compiled
+from protocol.mavlink_map import pose_from_wire, pose_to_wire
+from protocol.messages import FloatArray
+from protocol.scenario import Scenario
+
+
+@compiled
+def _loop(
+    packed_law: Packed,
+    packed_law_state: Packed,
+    packed_plant: Packed,
+    parameters: Packed,
+    delay_ns: int,
+    normal: FloatArray,
+    position_noise: float,
+    attitude_noise: float,
+    rows: FloatArray,
+) -> tuple[int, int]:
+    """Run len(rows) ticks; row k is q, q', command, tau, u (30 numbers) at t_k. Returns (rows made, outcome)."""
+    law, law_state, plant, body = packed_law[0], packed_law_state[0], packed_plant[0], parameters[0]
+    period_ns = law.period_ns
+    measured, seen, wire, allowed = np.empty(6), np.empty(6), np.empty(7), np.empty(6)
+    for k in range(rows.shape[0]):
+        t_ns = k * period_ns
+        add_noise(plant.motion, normal[k], position_noise, attitude_noise, measured)
+        pose_to_wire(measured, wire)
+        pose_from_wire(wire, seen)
+        control_step(law, law, law, period_ns, law_state, t_ns, seen, plant.motion[6:])
+        clamp(law_state.tau, law.lower, law.upper, allowed)
+        if not push_command(plant, t_ns + delay_ns, allowed):
+            return k, TOO_MANY_PENDING
+        apply_due_commands(plant, body, t_ns)
+        row = rows[k]
+        row[:12] = plant.motion
+        row[12:18] = law_state.tau
+        row[18:24] = plant.tau
+        row[24:30] = plant.u
+        outcome = advance(plant, body, body, t_ns, t_ns + period_ns, body.substep_ns)
+        if outcome != GOES_ON:
+            return k + 1, outcome
+    return rows.shape[0], GOES_ON
+
+
+class Simulation(NamedTuple):
+    """What a run left behind.
+
+    t_ns (n,), and (n, 6) each: q, q_dot true motion at t_k; command, the tau of the law (body frame); tau, what acts at the
+    motors at t_k; u, after the gears. divergence: why the run ended early, or None.
+    """
+
+    t_ns: np.typing.NDArray[np.int64]
+    q: FloatArray
+    q_dot: FloatArray
+    command: FloatArray
+    tau: FloatArray
+    u: FloatArray
+    law_counts: dict[str, int]
+    divergence: str | None
+
+
+def simulate(scenario: Scenario, law: Law | None = None) -> Simulation:
+    """Run a scenario; `law` replaces the scenario's own. A divergence ends the run early and is named in the result."""
+    law = law or make_law(scenario.law, scenario)
+    plant = Plant(scenario)
+    state = law.start()
+    rows = np.empty((scenario.ticks, 30))
+    normal = PositionSensor(scenario.noise, scenario.seed).draw(scenario.ticks)
+    count, outcome = _loop(
+        law.packed,
+        state.packed,
+        plant.state.packed,
+        plant.parameters,
+        scenario.delay_ns,
+        normal,
+        scenario.noise.position,
+        scenario.noise.attitude,
+        rows,
+    )
+    rows = rows[:count]
+    t_ns = np.arange(count, dtype=np.int64) * scenario.period_ns
+    return Simulation(
+        t_ns=t_ns,
+        q=rows[:, :6],
+        q_dot=rows[:, 6:12],
+        command=rows[:, 12:18],
+        tau=rows[:, 18:24],
+        u=rows[:, 24:],
+        law_counts=law.counts(state),
+        divergence=None if outcome == GOES_ON else divergence_sentence(outcome, count * scenario.period_ns),
+    )

@@ -1,0 +1,72 @@
+"""Results as tables on a terminal."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from protocol.messages import AXES
+
+DEGREES = 180.0 / math.pi
+
+
+def print_summary(summary: dict[str, Any], *, to_stderr: bool = False) -> None:
+    """Print the result of a run: tracking by axis, then one line each of what was counted and measured."""
+    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr)
+    console.print(_tracking_table(summary))
+    rate, lockstep = summary["ticks_per_s"], summary["clock"] == "lockstep"
+    mode = f", {summary['clock']}" if summary["clock"] else ""
+    console.print(
+        f"{summary['ticks']} ticks at {summary['rate_hz']:g} Hz ({summary['duration_s']:g} s{mode})"
+        + (f", {rate:.0f} ticks/s of wall time" if rate else "")
+    )
+    for name, what in (("latency_us", "loop latency"), ("tick_us", "whole tick")):
+        figures = summary.get(name) or {}
+        if figures.get("p50") is not None:
+            shown = ", ".join(f"{key} {figures[key]:.0f} us" for key in ("p50", "p99", "max"))
+            note = (
+                " (lockstep waits for every answer: its price, no latency test)"
+                if lockstep and name == "latency_us"
+                else ""
+            )
+            console.print(f"{what} {shown}{note}")
+    if counters := summary.get("counters"):
+        console.print(", ".join(f"{name} {counters[name]}" for name in ("missed", "late", "dropped", "refused")))
+
+
+def _tracking_table(summary: dict[str, Any]) -> Table:
+    settled = summary.get("rmse_settled")
+    title = f"{summary['scenario']}, law {summary['law']}, seed {summary['seed']}"
+    table = Table("axis", title=title, title_justify="left")
+    for column in ("RMSE", "MAE", *(("RMSE from 2 s", "MAE from 2 s") if settled else ())):
+        table.add_column(column, justify="right")
+    for axis in AXES:
+        values = [summary["rmse"][axis], summary["mae"][axis]]
+        if settled:
+            values += [settled[axis], summary["mae_settled"][axis]]
+        table.add_row(axis, *(show_error(axis, value) for value in values))
+    return table
+
+
+def show_error(axis: str, value: float | None) -> str:
+    """An error in the units one thinks in: mm, degrees."""
+    if value is None:
+        return "-"
+    return f"{1e3 * value:.2f} mm" if axis in AXES[:3] else f"{DEGREES * value:.3f} deg"
+
+
+def print_spread(spread: dict[str, Any], *, to_stderr: bool = False) -> None:
+    """Print the spread of RMSE over seeds."""
+    title = f"{spread['scenario']}, law {spread['law']}, {spread['rate_hz']:g} Hz, {spread['seeds']} seeds"
+    columns = [name for name in spread if name.startswith("rmse") and spread[name]]
+    table = Table("axis", title=title, title_justify="left")
+    for name in columns:
+        table.add_column(
+            name.replace("rmse_settled", "RMSE from 2 s").replace("rmse", "RMSE").replace("_", ", "), justify="right"
+        )
+    for axis in AXES:
+        table.add_row(axis, *(show_error(axis, spread[name][axis]) for name in columns))
+    Console(highlight=False, stderr=to_stderr).print(table)

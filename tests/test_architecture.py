@@ -1,0 +1,27 @@
+"""Rules of the house that no other tool holds."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from protocol.compiled import PACKAGES
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = [source for package in PACKAGES for source in sorted((ROOT / package).rglob("*.py"))]
+SHADOWED = {"can", "serial", "queue", "types", "signal", "mavlink"}
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=lambda source: str(source.relative_to(ROOT)))
+def test_only_the_clock_asks_for_the_time(source: Path) -> None:
+    text = source.read_text(encoding="utf-8")
+    if source.name != "clock.py":
+        assert not re.search(r"^\s*(import time\b|from time import|import datetime|from datetime)", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=lambda source: str(source.relative_to(ROOT)))
+def test_no_file_shadows_a_module_and_none_uses_mavutil(source: Path) -> None:
+    assert source.stem not in SHADOWED
+    assert "mavutil" not in re.sub(r'""".*?"""', "", source.read_text(encoding="utf-8"), flags=re.DOTALL)
