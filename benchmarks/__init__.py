@@ -1,0 +1,1 @@
+"""Benchmarks, each beside its anchor in the same run: `make bench`."""
