@@ -1,0 +1,40 @@
+"""The Lyapunov quantities (22)-(30) along a run, per axis (a sum over the axes would mix metres and radians).
+
+    q_z = q_e' + Lambda q_e (11)    V_1 = q_z^2 / 2 (22)    u~ = q_z' + K q_z    rho_1 = 2 K - 1 (27)    C_1 = u~^2 / 2 (28)
+
+u~ is taken from the run itself: with the law's extra pole (24) holds only about, so u_d - uhat is not exactly this; and the
+paper treats C_1 as a constant, for which its largest value so far stands here: V_1(t) <= V_1(0) + max C_1 / rho_1 (30).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from controller.reference import reference_trajectory
+from fwav_hil.simulate import Simulation
+from protocol.messages import FloatArray
+from protocol.scenario import NANOSECONDS, Scenario
+
+
+class Bound(NamedTuple):
+    """Per sample and axis, (n, 6) each: V_1, the bound (30), and whether it held."""
+
+    v1: FloatArray
+    bound: FloatArray
+    held: np.typing.NDArray[np.bool_]
+
+
+def lyapunov(scenario: Scenario, result: Simulation) -> Bound:
+    """The bound along a run; (n, 6), in m^2/s^2 and rad^2/s^2."""
+    k, lam = np.array(scenario.control.K), np.array(scenario.control.Lambda)
+    desired = reference_trajectory(scenario.reference, len(result.t_ns), scenario.period_ns)
+    error = result.q - desired[:, 0]
+    error[:, 3:] = (error[:, 3:] + np.pi) % (2.0 * np.pi) - np.pi
+    q_z = result.q_dot - desired[:, 1] + lam * error
+    u_tilde = np.gradient(q_z, scenario.period_ns / NANOSECONDS, axis=0) + k * q_z
+    v1 = 0.5 * q_z**2
+    c1 = np.maximum.accumulate(0.5 * u_tilde**2, axis=0)
+    bound = v1[0] + c1 / (2.0 * k - 1.0)
+    return Bound(v1, bound, v1 <= bound)

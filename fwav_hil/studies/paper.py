@@ -1,0 +1,155 @@
+"""The source paper's section IV, run again: its tables beside ours, its claims judged cell by cell.
+
+Conditions are simulated in process (`fwav_hil.simulate`), at the scenario's rate and duration; errors are in the paper's
+units, cm and rad, over the whole run, as in (34) and (35).
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from fwav_hil.score import scores
+from fwav_hil.simulate import Simulation, simulate
+from protocol.messages import AXES
+from protocol.scenario import Scenario
+
+PAPER_TABLES = Path(__file__).with_name("paper_tables.csv")
+CENTIMETRES = {axis: 100.0 if axis in AXES[:3] else 1.0 for axis in AXES}
+MEASURES = ("rmse", "mae")
+
+
+class Condition(NamedTuple):
+    """One column of a table: the paper's table and name for it, the law, and what is changed in the scenario's gains."""
+
+    table: str
+    name: str
+    law: str
+    control: dict[str, Any]
+
+    def scenario(self, base: Scenario) -> Scenario:
+        """The scenario of this condition."""
+        return msgspec.structs.replace(
+            base, law=self.law, control=msgspec.structs.replace(base.control, **self.control)
+        )
+
+
+def conditions(base: Scenario) -> tuple[Condition, ...]:
+    """Every column of tables II, III and IV, and two of our own (table "-") that the paper has no numbers for."""
+    control = base.control
+    products = tuple(k * lam / b for k, lam, b in zip(control.K, control.Lambda, control.b, strict=True))
+    sums = tuple((k + lam) / b for k, lam, b in zip(control.K, control.Lambda, control.b, strict=True))
+    return (
+        Condition("II", "PD", "pd", {}),
+        Condition("II", "DOB", "dob", {}),
+        Condition("II", "UDE", "ude", {}),
+        Condition("III", "with_compensation", "ude", {}),
+        Condition("III", "without_compensation", "uncompensated", {}),
+        Condition("IV", "T=0.01", "ude", {"T": (0.01,) * 6}),
+        Condition("IV", "T=0.1", "ude", {"T": (0.1,) * 6}),
+        Condition("IV", "T=1", "ude", {"T": (1.0,) * 6}),
+        Condition("-", "DOB_equal_gains_feed_forward", "dob_ff", {"Kp": products, "Kd": sums}),
+        Condition("-", "UDE_state_feedback", "ude_state", {}),
+    )
+
+
+class Row(msgspec.Struct, frozen=True):
+    """One cell pair: our RMSE and MAE of a channel under a condition, and the paper's (None where it has none)."""
+
+    scenario: str
+    table: str
+    condition: str
+    channel: str
+    rmse: float
+    mae: float
+    paper_rmse: float | None
+    paper_mae: float | None
+
+
+class Claim(msgspec.Struct, frozen=True):
+    """An ordering that the paper states, for one channel and measure: held by its own numbers? by ours?"""
+
+    scenario: str
+    claim: str
+    channel: str
+    measure: str
+    paper: bool
+    ours: bool
+
+
+class Flight(NamedTuple):
+    """A condition as it was flown."""
+
+    condition: Condition
+    scenario: Scenario
+    result: Simulation
+
+
+def fly_all(base: Scenario, progress: Callable[[str], None] = lambda _name: None) -> Iterator[Flight]:
+    """Fly every condition of a scenario; `progress` is told the name of each before it starts."""
+    for condition in conditions(base):
+        progress(f"{base.name}: {condition.name}")
+        scenario = condition.scenario(base)
+        yield Flight(condition, scenario, simulate(scenario))
+
+
+def paper_cells() -> dict[tuple[str, str, str], tuple[float, float]]:
+    """(table, condition, channel) -> (RMSE, MAE) as printed in the paper."""
+    with PAPER_TABLES.open(encoding="utf-8", newline="") as file:
+        return {
+            (cell["table"], cell["condition"], cell["channel"]): (float(cell["rmse"]), float(cell["mae"]))
+            for cell in csv.DictReader(file)
+        }
+
+
+def rows_of(flight: Flight) -> list[Row]:
+    """The cells of a flight, in the paper's units."""
+    printed = paper_cells()
+    score = scores(flight.scenario, flight.result.t_ns, flight.result.q)
+    rows = []
+    for axis in AXES:
+        paper_rmse, paper_mae = printed.get((flight.condition.table, flight.condition.name, axis), (None, None))
+        rmse, mae = (CENTIMETRES[axis] * score[measure][axis] for measure in MEASURES)
+        rows.append(
+            Row(
+                flight.scenario.name,
+                flight.condition.table,
+                flight.condition.name,
+                axis,
+                rmse,
+                mae,
+                paper_rmse,
+                paper_mae,
+            )
+        )
+    return rows
+
+
+ORDERINGS = (
+    ("UDE < PD", "II", "UDE", "PD"),
+    ("UDE < DOB", "II", "UDE", "DOB"),
+    ("DOB < PD", "II", "DOB", "PD"),
+    ("with < without compensation", "III", "with_compensation", "without_compensation"),
+    ("T = 0.01 < T = 0.1", "IV", "T=0.01", "T=0.1"),
+    ("T = 0.1 < T = 1", "IV", "T=0.1", "T=1"),
+)
+"""What the text of section IV states of its tables: (claim, table, the smaller, the larger)."""
+
+
+def judge(rows: list[Row]) -> list[Claim]:
+    """Each ordering of the paper, channel by channel, on the paper's numbers and on ours."""
+    cells = {(row.scenario, row.table, row.condition, row.channel): row for row in rows}
+    claims = []
+    for scenario in dict.fromkeys(row.scenario for row in rows):
+        for claim, table, smaller, larger in ORDERINGS:
+            for channel in AXES:
+                low, high = cells[scenario, table, smaller, channel], cells[scenario, table, larger, channel]
+                for measure in MEASURES:
+                    printed = getattr(low, f"paper_{measure}"), getattr(high, f"paper_{measure}")
+                    ours = getattr(low, measure) < getattr(high, measure)
+                    claims.append(Claim(scenario, claim, channel, measure, printed[0] < printed[1], ours))
+    return claims
