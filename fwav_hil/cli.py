@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -32,6 +33,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "simulate": ("fwav_hil.cli:simulate_command", "Fly a scenario in this process, without a link."),
         "emulator": ("plant_emulator.command:emulator", "Run the plant emulator alone."),
         "controller": ("controller.command:controller", "Run the controller alone."),
+        "paper": ("fwav_hil.studies.paper_command:paper_command", "Run the source paper's section IV again."),
         "report": ("fwav_hil.cli:report_command", "Score and plot a run folder again."),
     }
 )
@@ -123,18 +125,23 @@ def run_command(
     chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
     from controller.laws import make_law
     from fwav_hil.compile import compile_kernels
-    from fwav_hil.run import RunOptions, new_folder, run
-    from protocol.errors import UsageError
+    from fwav_hil.run import RunOptions, check_link, new_folder, run
+    from protocol.errors import FwavHilError, UsageError
 
     chosen_law = make_law(chosen.law, chosen)
     if chosen_law.needs_velocity:
         raise UsageError(chosen_law.velocity_sentence())
+    check_link(link)
     compile_kernels(chosen)
     folder = new_folder(chosen, out)
     try:
         run(chosen, folder, RunOptions(clock=clock, link=link, speed=speed, wait_s=wait_s))
-    finally:
-        _finish(folder, json_path, plots=plots)
+    except FwavHilError:
+        # The run's own error is the one to end with, whatever else its folder gives trouble with.
+        with contextlib.suppress(FwavHilError):
+            _finish(folder, json_path, plots=plots)
+        raise
+    _finish(folder, json_path, plots=plots)
 
 
 @click.command("simulate", epilog="\b\nExample:\n  fwav-hil simulate flapper --rate 500 --seeds 20 --json spread.json")
@@ -170,8 +177,10 @@ def simulate_command(
     from fwav_hil.run import new_folder
     from fwav_hil.simulated import simulate_run, simulate_spread
     from fwav_hil.tables import print_spread, print_summary
-    from protocol.errors import DivergenceError
+    from protocol.errors import DivergenceError, UsageError
 
+    if seeds and out:
+        raise UsageError("--seeds flies many runs and keeps none: leave out --out, or fly one --seed at a time")
     if seeds:
         spread = simulate_spread(chosen, seeds)
         print_spread(spread, to_stderr=is_stdout(json_path))

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from bridge.clock import local_stamp
+from bridge.link import parse_link_uri
 from bridge.process import StopFlag
 from bridge.summary import make_folder
 from fwav_hil.children import Child, listen
@@ -89,18 +90,24 @@ def choose_placement(clock: str) -> Placement:
     return Placement("placed by the scheduler, sleeping while they wait")
 
 
+def check_link(uri: str) -> None:
+    """Raise UsageError where a controller cannot come to the emulator on this link."""
+    if uri.partition("://")[0] not in _IN_TO_OUT:
+        raise UsageError(
+            f"`run` needs a link on which the controller can come to the emulator, and {uri} is none: use "
+            "udpin://host:port or tcpin://host:port, or start both ends by themselves"
+        )
+    parse_link_uri(uri)
+
+
 def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]:
     """Run both processes; returns the summary, which is also in the folder. Raises RunFailedError, Interrupted, ...
 
     Whatever happens the folder keeps what was recorded, no process stays behind, and the summary is written if there is
     anything to sum up.
     """
+    check_link(options.link)
     scheme, _, address = options.link.partition("://")
-    if scheme not in _IN_TO_OUT:
-        raise UsageError(
-            f"`run` needs a link on which the controller can come to the emulator, and {options.link} is none: use "
-            "udpin://host:port or tcpin://host:port, or start both ends by themselves"
-        )
     stop = StopFlag()
     stop.install()
     placement = choose_placement(options.clock)

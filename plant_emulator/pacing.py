@@ -70,6 +70,7 @@ class Lockstep(Pacing):
     answer, so stalls of the machine change nothing in the result. Every stamp in the log is simulation time.
 
     counters   resent   ticks sent again              foreign  frames that belong to no answer: strays, late copies
+               late, slipped    of the schedule, where `--speed` gives one (`RateKeeper`)
     """
 
     def __init__(
@@ -92,8 +93,11 @@ class Lockstep(Pacing):
         """One tick out, its one answer back."""
         self.stop.check()
         if self._keeper:
+            if tick == 0:
+                self._keeper.start()
             self._keeper.sleep()
             self._keeper.tick()
+            self.counters.update(self._keeper.counters)
         frames = self.emulator.sense(t_ns)
         datagram = b"".join(frames)
         t_us = t_ns // 1000

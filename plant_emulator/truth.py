@@ -114,4 +114,6 @@ def load_truth(path: Path) -> npt.NDArray[np.void]:
         rows: npt.NDArray[np.void] = np.load(path)
     except (OSError, EOFError, ValueError) as error:
         raise RunFolderError(f"cannot read the ground truth {path}: {error}") from None
+    if rows.dtype != ROW:
+        raise RunFolderError(f"cannot read the ground truth {path}: its columns are not those of a run")
     return rows

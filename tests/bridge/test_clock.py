@@ -22,7 +22,7 @@ class TestMonotonicClock:
         now = MonotonicClock().now_ns()
         assert before <= now <= time.monotonic_ns()
 
-    @pytest.mark.parametrize("wait_ns", [1, 999, 1_234_567, 20_000_000])
+    @pytest.mark.parametrize("wait_ns", [1, 999, 500_000, 20_000_000])
     def test_a_sleep_is_over_when_its_time_has_come_and_no_sooner(self, wait_ns: int) -> None:
         clock = MonotonicClock()
         deadline_ns = clock.now_ns() + wait_ns

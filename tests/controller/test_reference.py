@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import msgspec
 import numpy as np
 import pytest
@@ -26,7 +28,8 @@ def axes(draw: st.DrawFn) -> Axis:
     natural = draw(st.floats(0.5, 30.0))
     near = st.floats(-1e-6, 1e-6).map(lambda hair: 1.0 + hair)
     ratio = draw(st.one_of(st.floats(0.05, 0.95), st.just(1.0), near, st.floats(1.05, 4.0)))
-    swing = st.floats(-3.0, 3.0)
+    # Not so small that their squares vanish, for which scipy's error estimate divides zero by zero.
+    swing = st.integers(-3000, 3000).map(lambda thousandths: 1e-3 * thousandths)
     return (
         2.0 * ratio * natural,
         natural**2,
@@ -70,7 +73,7 @@ def solve_model(six: list[Axis], t: FloatArray) -> FloatArray:
         return np.concatenate((state[6:], acceleration(now, state[:6], state[6:])))
 
     start = np.concatenate((initial, np.zeros(6)))
-    y = solve_ivp(slope, (0.0, t[-1]), start, "DOP853", t_eval=t, rtol=1e-11, atol=1e-12).y.T
+    y = solve_ivp(slope, (0.0, t[-1]), start, "DOP853", t_eval=t, rtol=1e-12, atol=1e-15).y.T
     return np.array([(s[:6], s[6:], acceleration(now, s[:6], s[6:])) for now, s in zip(t, y, strict=True)])
 
 
@@ -86,14 +89,17 @@ def test_the_closed_form_solves_the_model(six: list[Axis]) -> None:
 
 
 @few
-@given(st.lists(axes(), min_size=6, max_size=6), st.floats(0.01, T_END))
+@given(st.lists(axes(), min_size=6, max_size=6), st.floats(0.0, T_END))
 def test_the_derivatives_are_those_of_what_they_derive(six: list[Axis], t: float) -> None:
-    reference, step = reference_of(six), 1e-5
-    before, now, after = (evaluate(reference, t + shift) for shift in (-step, 0.0, step))
-    slope = (after - before) / (2.0 * step)
-    scale = 1.0 + np.abs(now).max() * 100.0  # the third derivative is at most about 4 * 30 times the second
-    assert now[1] == pytest.approx(slope[0], rel=0.0, abs=1e-8 * scale)
-    assert now[2] == pytest.approx(slope[1], rel=0.0, abs=1e-7 * scale)
+    """The integral of each over a short time, by a quadrature that is exact to rounding, is what its primitive changed."""
+    reference, length = reference_of(six), 0.05
+    nodes, weights = np.polynomial.legendre.leggauss(24)
+    came = np.array([evaluate(reference, t + 0.5 * length * (1.0 + node)) for node in nodes.tolist()])
+    integral = 0.5 * length * np.tensordot(weights, came, axes=1)
+    change = evaluate(reference, t + length) - evaluate(reference, t)
+    scale = np.abs(came).max(axis=(0, 2)) + 1e-3
+    assert integral[1] == pytest.approx(change[0], rel=0.0, abs=1e-8 * scale[:2].max())
+    assert integral[2] == pytest.approx(change[1], rel=0.0, abs=1e-8 * scale[1:].max())
 
 
 @few
@@ -105,9 +111,14 @@ def test_it_starts_at_its_initial_value_at_rest(six: list[Axis]) -> None:
     assert came[1] == pytest.approx([0.0] * 6, rel=0.0, abs=1e-13 * scale)
 
 
+BASE: Axis = (20.0, 300.0, 2.0, 1.0, 3.0, 0.5, 1.0)
+ONE_OTHER_NUMBER = [(*BASE[:i], 1.5 * BASE[i], *BASE[i + 1 :]) for i in range(len(BASE))]
+
+
 @few
-@given(st.lists(axes(), min_size=3, max_size=3), st.lists(st.integers(0, 2), min_size=6, max_size=6))
-def test_an_axis_does_not_depend_on_its_neighbours(kinds: list[Axis], order: list[int]) -> None:
+@given(st.lists(st.sampled_from([BASE, *ONE_OTHER_NUMBER]), min_size=6, max_size=6), st.permutations(range(6)))
+@example([BASE, ONE_OTHER_NUMBER[0], BASE, ONE_OTHER_NUMBER[1], BASE, ONE_OTHER_NUMBER[4]], range(6))
+def test_an_axis_does_not_depend_on_its_neighbours(kinds: list[Axis], order: Sequence[int]) -> None:
     """Neighbours with the same model share what they can: never more than that."""
     together = evaluate(reference_of([kinds[kind] for kind in order]), 0.7)
     alone = [evaluate(reference_of([kind] * 6), 0.7) for kind in kinds]

@@ -85,7 +85,7 @@ def test_another_sensor_shifts_nobodys_noise() -> None:
 
 
 def readings(motion: FloatArray, u: FloatArray, world: World | None = None) -> list[float]:
-    return InertialSensors(MASS, world or World()).measure(motion, u).tolist()
+    return [float(reading) for reading in InertialSensors(MASS, world or World()).measure(motion, u)]
 
 
 def test_at_hover_the_specific_force_is_gravity_upward() -> None:
