@@ -11,10 +11,15 @@ from typing import Any, TextIO
 
 import msgspec
 
-from protocol.errors import Interrupted
+from bridge.clock import MonotonicClock
+from bridge.link import Link, open_link
+from protocol.errors import Interrupted, PeerMissingError
 
 Report = Callable[[dict[str, Any]], None]
 """Takes one event of a process: a dictionary with the key "event"."""
+
+
+_CONNECT_SLICE_S = 0.2
 
 
 class StopFlag:
@@ -35,7 +40,23 @@ class StopFlag:
     def check(self) -> None:
         """Raise Interrupted where a stop was requested."""
         if self.requested:
-            raise Interrupted("interrupted: what was recorded until then is kept")
+            raise Interrupted("interrupted")
+
+
+def open_patiently(uri: str, wait_s: float, stop: StopFlag) -> Link:
+    """`open_link`, waiting up to wait_s for a server to appear; a stop is heard while waiting.
+
+    Raises what `open_link` raises, and Interrupted.
+    """
+    clock = MonotonicClock()
+    give_up_ns = clock.now_ns() + round(wait_s * 1e9)
+    while True:
+        stop.check()
+        try:
+            return open_link(uri, connect_timeout_s=min(wait_s, _CONNECT_SLICE_S))
+        except PeerMissingError:
+            if clock.now_ns() >= give_up_ns:
+                raise
 
 
 def end_with_parent() -> None:

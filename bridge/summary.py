@@ -22,6 +22,22 @@ def make_folder(path: Path) -> None:
         raise RunFolderError(f"cannot create the folder {path}: {error.strerror}; choose another with --out") from None
 
 
+def refuse_existing_run(folder: Path) -> None:
+    """Raise RunFolderError where the folder holds a run already: nothing recorded is overwritten."""
+    if (folder / "run.tlog").exists() or (folder / "ground_truth.npy").exists():
+        raise RunFolderError(
+            f"{folder} holds a run already, which stays: choose another folder with --out, or remove it"
+        )
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file. Raises RunFolderError."""
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise RunFolderError(f"cannot write {path}: {error.strerror}; choose another folder with --out") from None
+
+
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write an indented JSON file in one piece: a reader sees the old file or the whole new one. Raises RunFolderError."""
     data = msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n"

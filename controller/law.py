@@ -72,7 +72,8 @@ class LawState(NamedTuple):
     uhat      (6,)    last estimate
     tau       (6,)    last command, body frame, exactly as the wire carries it
     desired   (3, 6)  q_d, q_d', q_d'' at the last sample
-    t_ns      (1,)    time of the last sample
+    t_ns      (1,)    the law's own time: that of the first sample and whole periods since
+    fresh     (1,)    not zero: the next sample starts the law
     counts    (4,)    STEPS, MISSED, RESTARTS, SATURATED
     r         (6, INPUTS)  inputs of the last step
     scratch   (3, 6)
@@ -86,6 +87,7 @@ class LawState(NamedTuple):
     tau: FloatArray
     desired: FloatArray
     t_ns: npt.NDArray[np.int64]
+    fresh: npt.NDArray[np.int64]
     counts: npt.NDArray[np.int64]
     r: FloatArray
     scratch: FloatArray
@@ -172,11 +174,12 @@ def control_step(
     """One step of the law on the sample `measured` (6,) of time t_ns; the command is then in state.tau (6,).
 
     Periods without a sample since the last step are stepped all at once (q linear, tau held); after a gap of an axis's
-    memory_s or more that axis starts again from its last estimate. A sample less than half a period after the last one
-    changes nothing: the command stands. `velocity` (6,) is read by state-feedback laws only.
+    memory_s or more that axis starts again from its last estimate. Periods are counted from the first sample on: one that
+    comes before the next of them is due by half changes nothing, the command stands. `velocity` (6,) is read by
+    state-feedback laws only.
     """
     q, r = state.scratch[0], state.r
-    first = state.counts[0] == 0
+    first = state.fresh[0] != 0
     periods = 1
     for i in range(3):
         q[i] = measured[i]
@@ -233,7 +236,8 @@ def control_step(
     _advance(law, state)
     for axis in range(6):
         state.q[axis] = q[axis]
-    state.t_ns[0] = t_ns
+    state.t_ns[0] = t_ns if first else state.t_ns[0] + periods * period_ns
+    state.fresh[0] = 0
     state.counts[0] += 1
 
 
@@ -282,6 +286,7 @@ class Law:
                 "tau": np.zeros(6),
                 "desired": np.zeros((3, 6)),
                 "t_ns": np.zeros(1, dtype=np.int64),
+                "fresh": np.ones(1, dtype=np.int64),
                 "counts": np.zeros(len(COUNTS), dtype=np.int64),
                 "r": np.zeros((6, INPUTS)),
                 "scratch": np.zeros((3, max(6, order))),
@@ -300,6 +305,11 @@ class Law:
             q_dot = _NO_VELOCITY
         packed_control_step(self.packed, state.packed, t_ns, q, q_dot)
         return state.tau.copy()
+
+    @staticmethod
+    def restart(state: LawState) -> None:
+        """Let the next sample start the law as its first did; what was counted stays."""
+        state.fresh[0] = 1
 
     def velocity_sentence(self) -> str:
         """Why a state-feedback law cannot run on a link."""

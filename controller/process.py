@@ -12,8 +12,8 @@ import numpy as np
 
 from bridge.clock import Clock, MonotonicClock
 from bridge.endpoint import VEHICLE, Endpoint
-from bridge.link import Link, open_link
-from bridge.process import Report, StopFlag
+from bridge.link import Link
+from bridge.process import Report, StopFlag, open_patiently
 from bridge.summary import make_folder, write_json
 from controller.actuation import HilActuation
 from controller.law import Law
@@ -25,7 +25,7 @@ from protocol.errors import FwavHilError, Interrupted, LinkClosedError, PeerLost
 from protocol.mavlink_codec import FrameReader, FrameWriter
 from protocol.messages import ActuatorCommand, PositionSample
 from protocol.scenario import Scenario
-from protocol.streams import HEARTBEAT_TIMEOUT_NS
+from protocol.streams import HEARTBEAT_TIMEOUT_NS, Due
 from protocol.tick_frames import CommandWriter, read_tick
 
 HELLO_PERIOD_S = 0.1
@@ -72,7 +72,7 @@ class Controller:
         self._lockstep = lockstep
         self._samples: deque[PositionSample] = deque()
         self._silence_ns = 0
-        self._begun = False
+        self._begun = self._was_armed = False
         self.counters = {"late_samples": 0}
 
     def run(self) -> None:
@@ -83,16 +83,20 @@ class Controller:
                 self.actuation.repeat()
                 continue
             armed = self.vehicle.armed
-            if not armed:
-                self.state = self.law.start()  # what a disarmed law remembers never acted
+            if not (armed and self._was_armed):
+                self.law.restart(self.state)  # what a disarmed law remembers never acted
+            self._was_armed = armed
             tau = self.law.step(self.state, sample.t_ns, sample.q)
             self.actuation.publish(ActuatorCommand(sample.t_ns, tau, armed), self.state.desired)
 
     def _meet(self) -> None:
         """Say hello until the first sample comes."""
-        for _ in range(max(1, round(self.options.wait_s / HELLO_PERIOD_S))):
+        give_up_ns = self.clock.now_ns() + round(self.options.wait_s * 1e9)
+        hello = Due(1.0 / HELLO_PERIOD_S)
+        while (now_ns := self.clock.now_ns()) < give_up_ns:
             self.stop.check()
-            self.endpoint.send(self.vehicle.hello())
+            if hello.at(now_ns):
+                self.endpoint.send(self.vehicle.hello())
             self._look(HELLO_PERIOD_S)
             if self._samples or self.vehicle.ended:
                 return
@@ -186,7 +190,7 @@ def run_controller(scenario: Scenario, options: ControllerOptions, report: Repor
     warm_up(law)
     uri = _told_link() if options.link == "-" else options.link
     report({"event": "waiting", "link": uri})
-    with open_link(uri, connect_timeout_s=options.wait_s) as link:
+    with open_patiently(uri, options.wait_s, stop) as link:
         link.spin_s = options.spin_s
         return serve(scenario, law, link, options, report, stop)
 

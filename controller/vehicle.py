@@ -61,11 +61,13 @@ class Vehicle:
             self.ended = True
 
     def _take_command(self, frame: Frame) -> None:
-        command, arm = mavlink_map.decode_arm_request(frame.payload)
-        accepted = command == mavlink_map.ARM_DISARM
+        request = mavlink_map.decode_arm_request(frame.payload)
+        if request.target_system not in (0, VEHICLE[0]) or request.target_component not in (0, VEHICLE[1]):
+            return
+        accepted = request.arm is not None and (self.agreed or not request.arm)
         if accepted:
-            self.armed = arm
-        payload = mavlink_map.encode_acknowledgement(command, accepted=accepted)
+            self.armed = bool(request.arm)
+        payload = mavlink_map.encode_acknowledgement(request.command, accepted=accepted)
         self._replies.append((mavlink_map.COMMAND_ACK, payload))
 
     def _heartbeat_frame(self) -> bytes:

@@ -218,7 +218,7 @@ def _finish(folder: Path, json_path: Path | None, *, plots: bool) -> None:
     path = folder / FILES["summary"]
     summary: dict[str, Any] = read_json(path)
     if not summary:
-        click.echo(f"run folder: {folder} (no tick was flown)", err=is_stdout(json_path))
+        click.echo(f"run folder: {folder} (it holds no tick)", err=is_stdout(json_path))
         return
     if plots:
         from fwav_hil.plots import plot_run

@@ -36,7 +36,15 @@ _DROPPED = (
     "sequence_gaps",
     "tick_without_pose",
 )
-_REFUSED = ("refused_commands", "bad_pose", "unknown_sender", "backwards", "old_commands", "unknown_flags")
+_REFUSED = (
+    "refused_commands",
+    "bad_pose",
+    "unknown_sender",
+    "backwards",
+    "old_commands",
+    "unknown_flags",
+    "unknown_echoes",
+)
 
 
 def summarise(folder: Path, *, placement: str = "") -> dict[str, Any]:

@@ -12,11 +12,11 @@ import numpy as np
 from bridge.clock import local_stamp
 from bridge.link import parse_link_uri
 from bridge.process import StopFlag
-from bridge.summary import make_folder
+from bridge.summary import make_folder, refuse_existing_run, write_text
 from fwav_hil.children import Child, listen
 from fwav_hil.progress import Progress
 from fwav_hil.report import FILES, summarise
-from protocol.errors import FwavHilError, Interrupted, RunFolderError, UsageError
+from protocol.errors import FwavHilError, Interrupted, PeerError, UsageError
 from protocol.scenario import NANOSECONDS, Scenario
 
 _IN_TO_OUT = {"udpin": "udpout", "tcpin": "tcpout"}
@@ -42,15 +42,9 @@ class RunFailedError(FwavHilError):
 def new_folder(scenario: Scenario, out: Path | None) -> Path:
     """The folder of a new run: `out`, or one named after the scenario and the time. Raises RunFolderError."""
     folder = out or Path("runs") / f"{scenario.name}-{scenario.law}-{local_stamp()}"
-    if (folder / FILES["log"]).exists() or (folder / FILES["ground_truth"]).exists():
-        raise RunFolderError(
-            f"{folder} holds a run already, which stays: choose another folder with --out, or remove it"
-        )
+    refuse_existing_run(folder)
     make_folder(folder)
-    try:
-        (folder / FILES["scenario"]).write_text(scenario.to_toml(), encoding="utf-8")
-    except OSError as error:
-        raise RunFolderError(f"cannot write to {folder}: {error.strerror}; choose another folder with --out") from None
+    write_text(folder / FILES["scenario"], scenario.to_toml())
     return folder
 
 
@@ -134,7 +128,9 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
         raise Interrupted(f"interrupted: what was recorded until then is in {folder}")
     for child in _culprit_first(emulator, controller):
         if child.failure:
-            raise RunFailedError(child.failure, child.process.returncode if child.process.returncode > 0 else 1)
+            raise RunFailedError(
+                child.failure, child.process.returncode if child.process.returncode > 0 else PeerError.exit_code
+            )
     return summary
 
 

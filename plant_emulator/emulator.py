@@ -82,6 +82,11 @@ class Emulator:
         row = self._truth.next_row(t_ns) if self._truth else self._unrecorded
         self.plant.record_and_advance(end_ns, self._command, row)
 
+    def flush(self) -> None:
+        """Hand the ground truth so far to the system."""
+        if self._truth:
+            self._truth.flush()
+
     def all_counters(self) -> dict[str, int]:
         """Everything counted, by name."""
         return {**self._endpoint.counters(), **self.safety.counters, **self.counters}

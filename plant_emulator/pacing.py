@@ -62,6 +62,12 @@ class Pacing(abc.ABC):
                     write(t_us, frame)
         self._owed.clear()
 
+    def flush(self) -> None:
+        """Hand what is logged so far to the system."""
+        self.settle_log()
+        if self.log:
+            self.log.flush()
+
 
 class Lockstep(Pacing):
     """Simulation time stands still until the answer to the tick is there: the `exact` profile.
@@ -110,7 +116,7 @@ class Lockstep(Pacing):
                 self.stop.check()
             self.endpoint.link.send(datagram)
             self.settle_log()
-            command = self._await_answer(t_ns, wait_s, received)
+            command = self._await_answer(t_ns, round(wait_s * 1e9), received)
             if command is not None:
                 self.latencies_ns.append(self.clock.now_ns() - sent_ns)
                 self._accept(tick, t_us, received)
@@ -121,10 +127,10 @@ class Lockstep(Pacing):
             "see whether it still runs"
         )
 
-    def _await_answer(self, t_ns: int, wait_s: float, received: list[Frame]) -> ActuatorCommand | None:
+    def _await_answer(self, t_ns: int, wait_ns: int, received: list[Frame]) -> ActuatorCommand | None:
         """The command that answers the tick, None where it did not come in time; `received` gathers its frames."""
-        deadline_ns = 0
-        timeout_s = wait_s
+        deadline_ns = self.clock.now_ns() + wait_ns
+        timeout_s = wait_ns * 1e-9
         while True:
             data = self.endpoint.link.recv(timeout_s)
             if data and not received and (command := self.emulator.decode_answer(data, t_ns)):
@@ -141,11 +147,10 @@ class Lockstep(Pacing):
                 # A late copy of an earlier answer: neither it nor what came with it belongs to this tick.
                 self.counters["foreign"] += len(received)
                 received.clear()
-            if not frames and timeout_s == 0.0:
+            remaining_ns = deadline_ns - self.clock.now_ns()
+            if (timeout_s == 0.0 and not data) or remaining_ns < -wait_ns:
                 return None
-            now_ns = self.clock.now_ns()
-            deadline_ns = deadline_ns or now_ns + (0 if not frames else round(wait_s * 1e9))
-            timeout_s = max(0.0, (deadline_ns - now_ns) * 1e-9)  # at 0 one last look: the machine may have stalled
+            timeout_s = max(0.0, remaining_ns * 1e-9)  # at 0 one last look: the machine may have stalled
 
     def _accept(self, tick: int, t_us: int, frames: list[Frame]) -> None:
         """Log the frames of an answer. Numbers restart at t = 0, so the first answer's own tells how many belong to it."""
@@ -158,13 +163,16 @@ class Lockstep(Pacing):
 
 
 class RealTime(Pacing):
-    """Simulation time is wall time: ticks on an absolute schedule, commands act the moment they arrive.
+    """Ticks on an absolute schedule of wall time; commands act the moment they arrive, so the link itself is the delay.
 
-    Late ticks are counted and never caught up in a burst; the link itself is the delay.
+    Late ticks are counted and never caught up in a burst: where the machine misses whole periods, simulation time lags
+    wall time by as many (`slipped`).
 
     counters   late, slipped    of the schedule (`RateKeeper`)
                unanswered       ticks whose command had not come when the next one was due
                old_commands     commands older than one that came before, dropped
+               repeated         commands that came again: they stand, and do not count as fresh
+               unknown_echoes   commands that answer no tick that was sent, dropped
     """
 
     def __init__(
@@ -184,13 +192,20 @@ class RealTime(Pacing):
         self._newest_ns = -1
         self._begun = False
         self._heard_ns = clock.now_ns()
-        self.counters = {**self._keeper.counters, "unanswered": 0, "old_commands": 0}
+        self.counters = {
+            **self._keeper.counters,
+            "unanswered": 0,
+            "old_commands": 0,
+            "repeated": 0,
+            "unknown_echoes": 0,
+        }
 
     def exchange(self, tick: int, t_ns: int) -> None:
         """Send the tick, then take commands until the next one is due."""
         self.stop.check()
         if tick == 0:
             self._keeper.start()
+            self._heard_ns = self.clock.now_ns()
         frames = self.emulator.sense(t_ns)
         begun_ns = self.clock.now_ns()
         self.endpoint.send(frames)
@@ -231,10 +246,14 @@ class RealTime(Pacing):
         if command.t_ns < self._newest_ns:
             self.counters["old_commands"] += 1
             return
-        if command.t_ns > self._newest_ns:
-            self._newest_ns = command.t_ns
-            sent_ns = self._sent.get(command.t_ns)
-            if sent_ns is not None:
-                self.latencies_ns.append(wall_ns - sent_ns)
-            self._sent = {t_ns: sent for t_ns, sent in self._sent.items() if t_ns > command.t_ns}
+        if command.t_ns == self._newest_ns:
+            self.counters["repeated"] += 1
+            return
+        sent_ns = self._sent.get(command.t_ns)
+        if sent_ns is None:
+            self.counters["unknown_echoes"] += 1
+            return
+        self._newest_ns = command.t_ns
+        self.latencies_ns.append(wall_ns - sent_ns)
+        self._sent = {t_ns: sent for t_ns, sent in self._sent.items() if t_ns > command.t_ns}
         self.emulator.act(arrival_ns, 0, command)

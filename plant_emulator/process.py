@@ -10,11 +10,11 @@ import numpy as np
 
 from bridge.clock import Clock, MonotonicClock
 from bridge.endpoint import VEHICLE, Endpoint, refuse_other_scenario
-from bridge.link import Link, open_link
+from bridge.link import Link
 from bridge.memory import memory_pair
-from bridge.process import Report, StopFlag
+from bridge.process import Report, StopFlag, open_patiently
 from bridge.rate import RateKeeper
-from bridge.summary import make_folder, percentiles_us, write_json
+from bridge.summary import make_folder, percentiles_us, refuse_existing_run, write_json, write_text
 from plant_emulator.emulator import Emulator
 from plant_emulator.pacing import Lockstep, Pacing, RealTime
 from plant_emulator.truth import TruthWriter
@@ -22,6 +22,7 @@ from protocol import mavlink_map
 from protocol.errors import FwavHilError, PeerMissingError, RunFolderError
 from protocol.messages import ActuatorCommand
 from protocol.scenario import NANOSECONDS, Scenario
+from protocol.streams import Due
 from protocol.tlog import TlogWriter
 
 HELLO_PERIOD_S = 0.1
@@ -47,7 +48,7 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
 def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
     """Open the link and `fly`. Raises the errors of `protocol.errors`."""
     warm_up(scenario)
-    with open_link(options.link, connect_timeout_s=options.wait_s) as link:
+    with open_patiently(options.link, options.wait_s, stop) as link:
         link.spin_s = options.spin_s
         return fly(scenario, link, options, report, stop)
 
@@ -61,8 +62,9 @@ def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report
     log = truth = None
     try:
         if options.out:
+            refuse_existing_run(options.out)
             make_folder(options.out)
-            (options.out / "scenario.toml").write_text(scenario.to_toml(), encoding="utf-8")
+            write_text(options.out / "scenario.toml", scenario.to_toml())
             log, truth = TlogWriter(options.out / "run.tlog"), TruthWriter(options.out / "ground_truth.npy")
         endpoint = Endpoint(link, VEHICLE[0], scenario.wire.emulator_component)
         emulator = Emulator(scenario, endpoint, truth)
@@ -107,13 +109,16 @@ def _meet_controller(scenario: Scenario, options: EmulatorOptions, endpoint: End
     """Hold the plant at t = 0 until a controller with the same scenario says it is armed."""
     digest = scenario.digest()
     agreed = heard = False
-    for _ in range(max(1, round(options.wait_s / HELLO_PERIOD_S))):
+    clock = MonotonicClock()
+    give_up_ns = clock.now_ns() + round(options.wait_s * NANOSECONDS)
+    due = Due(1.0 / HELLO_PERIOD_S)
+    while (now_ns := clock.now_ns()) < give_up_ns:
         stop.check()
         hello = [
             endpoint.seal(mavlink_map.HEARTBEAT, mavlink_map.encode_emulator_heartbeat()),
             endpoint.seal(mavlink_map.VERSION, mavlink_map.encode_version(digest)),
         ]
-        if heard:
+        if heard and due.at(now_ns):
             endpoint.send(hello)
         for frame in endpoint.receive(HELLO_PERIOD_S):
             if (frame.system, frame.component) != VEHICLE:
@@ -134,8 +139,7 @@ def _meet_controller(scenario: Scenario, options: EmulatorOptions, endpoint: End
     uri = endpoint.link.uri
     if heard:
         raise PeerMissingError(
-            f"the controller at {endpoint.link.peer} did not arm within {options.wait_s:g} s: start it with --arm, "
-            "or arm it from a ground station (MAV_CMD_COMPONENT_ARM_DISARM)"
+            f"the controller at {endpoint.link.peer} did not arm within {options.wait_s:g} s: start it with --arm"
         )
     raise PeerMissingError(
         f"no controller came to {uri} within {options.wait_s:g} s: start one with `fwav-hil controller "
@@ -163,6 +167,8 @@ def _run_ticks(
             last_ns = now_ns
             if now_ns >= next_progress_ns:
                 next_progress_ns = now_ns + PROGRESS_PERIOD_NS
+                pacing.flush()
+                emulator.flush()
                 report({"event": "progress", "t_ns": t_ns + period_ns, "q": emulator.plant.state.motion[:6].tolist()})
     except FwavHilError as stopped:
         error = stopped

@@ -39,7 +39,7 @@ class SafetyEnvelope:
         self._upper = np.array(actuators.upper)
         self._safe = np.array(actuators.safe)
         self._staleness_ns = round(actuators.staleness_s * NANOSECONDS)
-        self._last_ns: int | None = None
+        self._last_ns: int | None = 0  # from t = 0 on a first command is awaited, like any other
         self.counters = {"clamped": 0, "disarmed": 0, "stale": 0}
 
     def accept(self, t_ns: int, command: ActuatorCommand) -> FloatArray:

@@ -8,7 +8,7 @@ A payload that holds bad data (NaN where a number must be, a quaternion that is 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -331,17 +331,27 @@ def encode_attitude_target(t_ns: int, q: FloatArray) -> bytes:
     return ATTITUDE_TARGET.pack_fields(time_boot_ms=t_ns // 1_000_000, q=attitude, type_mask=ignored)
 
 
-def decode_arm_request(payload: bytes) -> tuple[int, bool]:
-    """(command, arm?) of a COMMAND_LONG; NaN is legal in its unused parameters."""
+class ArmRequest(NamedTuple):
+    """A COMMAND_LONG as the controller reads it; arm is None where it asks for neither arming nor disarming."""
+
+    command: int
+    target_system: int
+    target_component: int
+    arm: bool | None
+
+
+def decode_arm_request(payload: bytes) -> ArmRequest:
+    """The request in a COMMAND_LONG; param1 must be 1 or 0, while NaN is legal in the parameters that are not used."""
     values = COMMAND_LONG.unpack_fields(payload)
-    return int(values["command"]), bool(values["param1"] == 1.0)
+    command = int(values["command"])
+    arm = {1.0: True, 0.0: False}.get(values["param1"]) if command == ARM_DISARM else None
+    return ArmRequest(command, int(values["target_system"]), int(values["target_component"]), arm)
 
 
 def encode_acknowledgement(command: int, *, accepted: bool) -> bytes:
-    """COMMAND_ACK payload: accepted, or unsupported."""
-    return COMMAND_ACK.pack_fields(
-        command=command, result=common.MAV_RESULT_ACCEPTED if accepted else common.MAV_RESULT_UNSUPPORTED
-    )
+    """COMMAND_ACK payload: accepted; else denied, or unsupported where it was no arming command."""
+    refused = common.MAV_RESULT_DENIED if command == ARM_DISARM else common.MAV_RESULT_UNSUPPORTED
+    return COMMAND_ACK.pack_fields(command=command, result=common.MAV_RESULT_ACCEPTED if accepted else refused)
 
 
 ARM_DISARM = common.MAV_CMD_COMPONENT_ARM_DISARM

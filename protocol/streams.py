@@ -19,6 +19,7 @@ class End(enum.Enum):
     EMULATOR = "emulator"
     CONTROLLER = "controller"
     BOTH = "both"
+    STATION = "ground station"
 
 
 class Stream(NamedTuple):
@@ -41,7 +42,7 @@ STREAMS = (
     Stream("HIL_ACTUATOR_CONTROLS", End.CONTROLLER, None, "one for each tick; time_usec echoes the sample it answers"),
     Stream("POSITION_TARGET_LOCAL_NED", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
     Stream("ATTITUDE_TARGET", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
-    Stream("COMMAND_LONG", End.BOTH, None, "to the controller: 400 (arm, disarm)"),
+    Stream("COMMAND_LONG", End.STATION, None, "to the controller: 400 (arm, disarm)"),
     Stream("COMMAND_ACK", End.CONTROLLER, None, "the answer to it"),
 )
 

@@ -15,7 +15,13 @@ from bridge.udp import UdpIn
 from fwav_hil.simulate import simulate
 from plant_emulator.truth import load_truth
 from protocol import mavlink_map
-from protocol.errors import DivergenceError, PeerLostError, PeerMissingError, ScenarioMismatchError
+from protocol.errors import (
+    DivergenceError,
+    PeerLostError,
+    PeerMissingError,
+    RunFolderError,
+    ScenarioMismatchError,
+)
 from protocol.mavlink_codec import FrameWriter
 from protocol.tlog import read_tlog
 from tests.loop import fly_both, scenario_of
@@ -169,6 +175,68 @@ def test_a_ground_station_arms_the_controller(tmp_path: Path) -> None:
         ends = fly_both(SHORT, with_station, far, tmp_path, arm=False)
     assert isinstance(ends.emulator, dict), ends
     assert ends.emulator["counters"]["disarmed"] == 0
+
+
+class Dripping(Link):
+    """A stream that hands on what it receives in pieces of a few bytes, as a slow serial line does."""
+
+    is_datagram = False
+
+    def __init__(self, link: Link) -> None:
+        super().__init__(link.uri)
+        self._link = link
+        self._waiting = b""
+
+    def recv(self, timeout_s: float) -> bytes | None:
+        if not self._waiting:
+            self._waiting = self._link.recv(timeout_s) or b""
+        piece, self._waiting = self._waiting[:7], self._waiting[7:]
+        return piece or None
+
+    def send(self, data: bytes | bytearray | memoryview) -> None:
+        self._link.send(data)
+
+    def close(self) -> None:
+        self._link.close()
+
+    @property
+    def peer(self) -> str:
+        return self._link.peer
+
+
+def test_a_stream_that_comes_in_pieces_is_no_silence(tmp_path: Path) -> None:
+    near, far = memory_pair()
+    with near, far:
+        ends = fly_both(SHORT, Dripping(near), Dripping(far), tmp_path)
+    assert isinstance(ends.emulator, dict), ends
+    assert ends.emulator["counters"]["resent"] == 0
+    assert np.array_equal(load_truth(tmp_path / "ground_truth.npy")["q"], simulate(SHORT).q)
+
+
+@pytest.mark.parametrize(("ticks_hz", "law_hz"), [(500.0, 250.0), (1000.0, 250.0), (500.0, 200.0)])
+def test_a_law_that_is_slower_than_the_ticks_steps_at_its_own_rate(
+    ticks_hz: float, law_hz: float, tmp_path: Path
+) -> None:
+    near, far = memory_pair()
+    scenario = scenario_of("flapper", duration_s=0.4, rate_hz=ticks_hz)
+    with near, far:
+        ends = fly_both(scenario, near, far, tmp_path, controller_scenario=scenario_of("flapper", rate_hz=law_hz))
+    assert isinstance(ends.controller, dict), ends
+    assert abs(ends.controller["counters"]["steps"] - 0.4 * law_hz) <= 1
+    assert isinstance(ends.emulator, dict)
+    assert ends.emulator["ticks"] == 0.4 * ticks_hz  # and every tick had its answer
+
+
+def test_an_emulator_does_not_overwrite_a_run(tmp_path: Path) -> None:
+    near, far = memory_pair()
+    with near, far:
+        fly_both(SHORT, near, far, tmp_path)
+    before = (tmp_path / "run.tlog").read_bytes()
+    near, far = memory_pair()
+    with near, far:
+        ends = fly_both(SHORT, near, far, tmp_path, wait_s=0.3)
+    assert isinstance(ends.emulator, RunFolderError)
+    assert (tmp_path / "run.tlog").read_bytes() == before
 
 
 def test_silence_ends_the_run_with_a_named_error_and_a_log_up_to_there(tmp_path: Path) -> None:

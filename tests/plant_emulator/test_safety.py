@@ -85,9 +85,12 @@ def test_disarmed_the_motors_get_zeros(envelope: SafetyEnvelope) -> None:
     assert envelope.counters == {"clamped": 0, "disarmed": 1, "stale": 0}
 
 
-def test_before_the_first_command_nothing_can_grow_stale(envelope: SafetyEnvelope) -> None:
-    assert envelope.stale_output(100 * STALENESS_NS) is None
-    assert envelope.counters["stale"] == 0
+def test_a_first_command_that_does_not_come_is_stale_as_any_other(envelope: SafetyEnvelope) -> None:
+    assert envelope.stale_output(STALENESS_NS) is None
+    stale = envelope.stale_output(STALENESS_NS + 1)
+    assert stale is not None
+    assert stale[0] == STALENESS_NS
+    assert envelope.counters["stale"] == 1
 
 
 def test_a_command_is_stale_just_after_its_time_and_once_an_outage(envelope: SafetyEnvelope) -> None:

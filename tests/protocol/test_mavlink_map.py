@@ -406,14 +406,14 @@ class TestReference:
 
 class TestArming:
     @pytest.mark.parametrize(
-        ("param1", "arm"), [(1.0, True), (0.0, False), (math.nan, False), (math.inf, False), (2.0, False)]
+        ("param1", "arm"), [(1.0, True), (0.0, False), (math.nan, None), (math.inf, None), (0.5, None)]
     )
     @pytest.mark.parametrize("unused", [0.0, math.nan, math.inf])
-    def test_nan_is_legal_in_the_unused_parameters(self, param1: float, arm: bool, unused: float) -> None:
+    def test_nan_is_legal_in_the_unused_parameters(self, param1: float, arm: bool | None, unused: float) -> None:
         # MAVSDK arms with param2 = NaN.
         message = common.MAVLink_command_long_message(1, 1, 400, 0, param1, *[unused] * 6)
         (frame,) = FrameReader(is_datagram=True).read(message.pack(common.MAVLink(None)))
-        assert mavlink_map.decode_arm_request(frame.payload) == (400, arm)
+        assert mavlink_map.decode_arm_request(frame.payload) == (400, 1, 1, arm)
         assert mavlink_map.ARM_DISARM == 400
 
     @pytest.mark.parametrize("command", [0, 400, 511, 65535])
@@ -421,6 +421,8 @@ class TestArming:
     def test_the_answer_names_the_command_and_the_outcome(self, command: int, accepted: bool, result: int) -> None:
         payload = mavlink_map.encode_acknowledgement(command, accepted=accepted)
         message = parsed(mavlink_map.COMMAND_ACK, payload)
+        if not accepted and command == mavlink_map.ARM_DISARM:
+            result = common.MAV_RESULT_DENIED  # a command it knows, and does not obey now
         assert (message.get_type(), message.command, message.result) == ("COMMAND_ACK", command, result)
 
 

@@ -1,0 +1,75 @@
+"""Arming: who may ask for it, and when it is obeyed."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from bridge.endpoint import Endpoint
+from bridge.memory import memory_pair
+from controller.vehicle import Vehicle
+from protocol import mavlink_map
+from protocol.errors import ScenarioMismatchError
+from protocol.mavlink_codec import Frame, FrameReader, FrameWriter, Layout
+
+DIGEST = b"12345678"
+
+
+def frame(system: int, component: int, message: Layout, payload: bytes) -> Frame:
+    (read,) = FrameReader(is_datagram=True).read(FrameWriter(system, component).seal(message, payload))
+    return read
+
+
+def request(param1: float, *, target: tuple[int, int] = (1, 1), command: int = mavlink_map.ARM_DISARM) -> Frame:
+    payload = mavlink_map.COMMAND_LONG.pack_fields(
+        command=command, param1=param1, param2=math.nan, target_system=target[0], target_component=target[1]
+    )
+    return frame(255, 190, mavlink_map.COMMAND_LONG, payload)
+
+
+def vehicle(*, arm: bool = False, agreed: bool = True) -> Vehicle:
+    near, _ = memory_pair()
+    made = Vehicle(Endpoint(near, 1, 1), DIGEST, 191, arm=arm)
+    if agreed:
+        made.take(frame(1, 191, mavlink_map.VERSION, mavlink_map.encode_version(DIGEST)))
+    return made
+
+
+def test_it_starts_disarmed_and_arms_by_itself_only_when_told_to() -> None:
+    assert not vehicle(arm=True, agreed=False).armed
+    assert vehicle(arm=True).armed
+    assert not vehicle(arm=False).armed
+
+
+def test_a_station_arms_and_disarms_it() -> None:
+    made = vehicle()
+    made.take(request(1.0))
+    assert made.armed
+    made.take(request(0.0))
+    assert not made.armed
+
+
+@pytest.mark.parametrize("param1", [math.nan, 0.5, -1.0])
+def test_what_asks_for_neither_changes_nothing(param1: float) -> None:
+    made = vehicle(arm=True)
+    made.take(request(param1))
+    assert made.armed
+
+
+def test_requests_to_others_and_other_commands_change_nothing() -> None:
+    made = vehicle()
+    for one in (request(1.0, target=(2, 1)), request(1.0, target=(1, 2)), request(1.0, command=511)):
+        made.take(one)
+    assert not made.armed
+
+
+def test_it_does_not_arm_before_the_emulator_has_shown_the_same_scenario() -> None:
+    made = vehicle(agreed=False)
+    made.take(request(1.0))
+    assert not made.armed
+
+
+def test_another_scenario_is_refused() -> None:
+    with pytest.raises(ScenarioMismatchError):
+        vehicle().take(frame(1, 191, mavlink_map.VERSION, mavlink_map.encode_version(b"87654321")))
