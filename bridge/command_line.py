@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import click
 
 from bridge.process import Report, StopFlag, end_with_parent, report_json, sit_on_core
-from protocol.errors import FwavHilError, Interrupted
+from protocol.errors import FwavHilError, Interrupted, RunFolderError
 from protocol.scenario import Scenario, find_scenario, load_scenario, with_overrides
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -37,7 +37,9 @@ duration_option = click.option(
 )
 seed_option = click.option("--seed", type=click.IntRange(min=0), help="Seed of the noise instead of the scenario's.")
 law_option = click.option(
-    "--law", metavar="LAW", help="Law instead of the scenario's: ude, pd, dob, dob_ff, uncompensated."
+    "--law",
+    metavar="LAW",
+    help="Law instead of the scenario's: ude, pd, dob, dob_ff, uncompensated; ude_state in `simulate`.",
 )
 clock_option = click.option(
     "--clock", type=click.Choice(["lockstep", "realtime"]), default="lockstep", show_default=True,
@@ -99,7 +101,9 @@ def run_command(command: click.Command, name: str, arguments: Sequence[str] | No
         click.echo(f"{name}: {error}", err=True)
         return error.exit_code
     except click.ClickException as error:
-        error.show()
+        context = getattr(error, "ctx", None)
+        place = context.command_path if context else name
+        click.echo(f"{place}: {error.format_message()} (see `{place} --help`)", err=True)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         click.echo(f"{name}: interrupted", err=True)
@@ -110,4 +114,9 @@ def run_command(command: click.Command, name: str, arguments: Sequence[str] | No
         # Whoever read our output has left: click and rich then exit with 1. Hand the interpreter a place to flush to.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        # Files have named errors of their own; what is left is the output itself, on a full disk, say.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        click.echo(f"{name}: cannot write the output: {error.strerror or error}", err=True)
+        return RunFolderError.exit_code
     return result if isinstance(result, int) else 0

@@ -69,6 +69,7 @@ class Controller:
         lockstep = options.clock == "lockstep"
         self.actuation = HilActuation(self.endpoint, self.vehicle, law.output.scale, lockstep=lockstep)
         self._patience_s = LOOK_PERIOD_S if lockstep else PATIENCE_PERIODS * scenario.period_ns * 1e-9
+        self._period_s = self._patience_s if lockstep else scenario.period_ns * 1e-9
         self._lockstep = lockstep
         self._samples: deque[PositionSample] = deque()
         self._silence_ns = 0
@@ -115,7 +116,8 @@ class Controller:
         while not self._samples and not self.vehicle.ended:
             self.stop.check()
             begun_ns = self.clock.now_ns()
-            if self._look(self._patience_s):
+            # Once a sample is late, the command that stands is given again each period.
+            if self._look(self._period_s if self._silence_ns else self._patience_s):
                 self._silence_ns = 0
                 continue
             # Waits are added up one by one: a stall of the whole machine then counts as one wait, not as silence.
