@@ -19,7 +19,7 @@ class HilActuation:
     def __init__(self, endpoint: Endpoint, vehicle: Vehicle, scale: FloatArray, *, lockstep: bool) -> None:
         self._endpoint = endpoint
         self._vehicle = vehicle
-        self._commands = CommandWriter(endpoint.writer, scale, lockstep=lockstep)
+        self.commands = CommandWriter(endpoint.writer, scale, lockstep=lockstep)
         self._reference = Due(stream("POSITION_TARGET_LOCAL_NED").rate_hz or 1.0)
         self._last = b""
         self.answered_ns = -1
@@ -34,10 +34,19 @@ class HilActuation:
         if self._reference.at(t_ns):
             frames.append(seal(mavlink_map.POSITION_TARGET, mavlink_map.encode_position_target(t_ns, *desired)))
             frames.append(seal(mavlink_map.ATTITUDE_TARGET, mavlink_map.encode_attitude_target(t_ns, desired[0])))
-        frames.append(self._commands.frame(command))
-        self._last = b"".join(frames)
+        frames.append(self.commands.frame(command))
+        self.send(t_ns, b"".join(frames))
+
+    def send(self, t_ns: int, answer: bytes) -> None:
+        """Send the whole answer to the sample of t_ns, and keep it."""
+        self._last = answer
         self.answered_ns = t_ns
-        self._endpoint.link.send(self._last)
+        self._endpoint.link.send(answer)
+
+    @property
+    def quiet_until_ns(self) -> int:
+        """An answer to a sample before this time is the command alone."""
+        return min(self._vehicle.quiet_until_ns, self._reference.next_ns)
 
     def repeat(self) -> None:
         """Give the last answer again, the same bytes, without a step of the law."""

@@ -13,20 +13,21 @@ import numpy as np
 from bridge.clock import Clock, MonotonicClock
 from bridge.endpoint import VEHICLE, Endpoint
 from bridge.link import Link
+from bridge.memory import memory_pair
 from bridge.process import Report, StopFlag, open_patiently
 from bridge.summary import make_folder, write_json
 from controller.actuation import HilActuation
 from controller.law import Law
 from controller.laws import make_law
+from controller.quick import QuickAnswers
 from controller.telemetry import HilTelemetry
 from controller.vehicle import Vehicle
 from protocol import mavlink_map
 from protocol.errors import FwavHilError, Interrupted, LinkClosedError, PeerLostError, PeerMissingError, UsageError
-from protocol.mavlink_codec import FrameReader, FrameWriter
 from protocol.messages import ActuatorCommand, PositionSample
 from protocol.scenario import Scenario
 from protocol.streams import HEARTBEAT_TIMEOUT_NS, Due
-from protocol.tick_frames import CommandWriter, read_tick
+from protocol.tick_frames import CommandWriter
 
 HELLO_PERIOD_S = 0.1
 LOOK_PERIOD_S = 0.1
@@ -65,9 +66,12 @@ class Controller:
         self.options = options
         self.endpoint = Endpoint(link, *VEHICLE)
         self.vehicle = Vehicle(self.endpoint, scenario.digest(), component, arm=options.arm)
-        self.telemetry = HilTelemetry(self.endpoint, component)
+        self.telemetry = HilTelemetry(component)
         lockstep = options.clock == "lockstep"
         self.actuation = HilActuation(self.endpoint, self.vehicle, law.output.scale, lockstep=lockstep)
+        self._quick = QuickAnswers(
+            law, self.state, self.endpoint, self.actuation.commands, component, lockstep=lockstep
+        )
         self._patience_s = LOOK_PERIOD_S if lockstep else PATIENCE_PERIODS * scenario.period_ns * 1e-9
         self._period_s = self._patience_s if lockstep else scenario.period_ns * 1e-9
         self._lockstep = lockstep
@@ -89,6 +93,7 @@ class Controller:
             self._was_armed = armed
             tau = self.law.step(self.state, sample.t_ns, sample.q)
             self.actuation.publish(ActuatorCommand(sample.t_ns, tau, armed), self.state.desired)
+            self._get_ready()
 
     def _meet(self) -> None:
         """Say hello until the first sample comes."""
@@ -144,9 +149,7 @@ class Controller:
             ) from None
         if not data:
             return False
-        sample = self.telemetry.take_datagram(data) if self._begun else None
-        if sample:
-            self._samples.append(sample)
+        if self._answer_at_once(data):
             return True
         for frame in self.endpoint.reader.read(data):
             if self.telemetry.is_telemetry(frame):
@@ -158,7 +161,23 @@ class Controller:
                     self._samples.append(sample)
             else:
                 self.vehicle.take(frame)
+        self._get_ready()
         return True
+
+    def _answer_at_once(self, data: bytes) -> bool:
+        """Answer a plain sample on the short way; False, with nothing done, where it is not one."""
+        t_ns, answer = self._quick.to(data)
+        if t_ns < 0:
+            return False
+        self.actuation.send(t_ns, answer)
+        self.telemetry.taken(t_ns)
+        self._get_ready()
+        return True
+
+    def _get_ready(self) -> None:
+        """Say which samples may be answered at once: those after the last one, while armed and nothing else is due."""
+        armed = self._was_armed and self.vehicle.armed and not self._samples
+        self._quick.get_ready(self.actuation.answered_ns, self.actuation.quiet_until_ns if armed else 0)
 
     def summary(self) -> dict[str, int]:
         """Everything counted at this end, by name."""
@@ -177,8 +196,15 @@ def warm_up(law: Law) -> None:
     mavlink_map.encode_attitude_target(0, np.zeros(6))
     state = law.start()
     command = ActuatorCommand(0, law.step(state, 0, np.zeros(6)), armed=True)
-    CommandWriter(FrameWriter(*VEHICLE), law.output.scale, lockstep=True).frame(command)
-    read_tick(b"", VEHICLE, FrameReader(is_datagram=True))
+    near, far = memory_pair()
+    with near, far:
+        endpoint = Endpoint(near, *VEHICLE)
+        commands = CommandWriter(endpoint.writer, law.output.scale, lockstep=True)
+        commands.frame(command)
+        endpoint.reader.expect(VEHICLE, 0)
+        quick = QuickAnswers(law, state, endpoint, commands, VEHICLE[1], lockstep=True)
+        quick.get_ready(-1, 0)
+        quick.to(b"")
 
 
 def run_controller(scenario: Scenario, options: ControllerOptions, report: Report, stop: StopFlag) -> dict[str, Any]:

@@ -6,11 +6,10 @@ HIL_GPS, HIL_STATE_QUATERNION and ODOMETRY are not looked at.
 
 from __future__ import annotations
 
-from bridge.endpoint import VEHICLE, Endpoint
+from bridge.endpoint import VEHICLE
 from protocol import mavlink_map
 from protocol.mavlink_codec import Frame
 from protocol.messages import PositionSample
-from protocol.tick_frames import read_tick
 
 
 class HilTelemetry:
@@ -22,21 +21,15 @@ class HilTelemetry:
                backwards          ticks older than the newest one
     """
 
-    def __init__(self, endpoint: Endpoint, emulator_component: int) -> None:
-        self._endpoint = endpoint
+    def __init__(self, emulator_component: int) -> None:
         self._sender = (VEHICLE[0], emulator_component)
         self._pose: PositionSample | None = None
         self._newest_ns = -1
         self.counters = {"unknown_sender": 0, "bad_pose": 0, "tick_without_pose": 0, "backwards": 0}
 
-    def take_datagram(self, data: bytes) -> PositionSample | None:
-        """The sample in a datagram of just a pose and its tick; None where it is anything else, with nothing counted."""
-        sample = read_tick(data, self._sender, self._endpoint.reader)
-        if sample is None or sample.t_ns < self._newest_ns:
-            return None
-        self._newest_ns = sample.t_ns
-        self._pose = sample
-        return sample
+    def taken(self, t_ns: int) -> None:
+        """Take note of the sample of time t_ns, read elsewhere."""
+        self._newest_ns = t_ns
 
     def is_telemetry(self, frame: Frame) -> bool:
         """Whether a frame is one of the two messages read here."""

@@ -45,6 +45,11 @@ class Vehicle:
             frames.append(self._heartbeat_frame())
         return frames
 
+    @property
+    def quiet_until_ns(self) -> int:
+        """Until then `due_frames` are none."""
+        return 0 if self._replies else self._heartbeat.next_ns
+
     def take(self, frame: Frame) -> None:
         """React to a frame that is no telemetry. Raises ScenarioMismatchError."""
         number = frame.message_id

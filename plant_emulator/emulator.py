@@ -7,16 +7,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.endpoint import VEHICLE, Endpoint
+from bridge.endpoint import Endpoint
 from plant_emulator.integrate import Plant
+from plant_emulator.quick import QuickTicks
 from plant_emulator.safety import SafetyEnvelope
-from plant_emulator.sensors import InertialSensors, PositionSensor
+from plant_emulator.sensors import InertialSensors
 from plant_emulator.truth import TruthWriter
 from protocol import mavlink_map
+from protocol.errors import DivergenceError
 from protocol.messages import ActuatorCommand
 from protocol.scenario import Scenario
 from protocol.streams import Due, stream
-from protocol.tick_frames import TickWriter, read_command
 
 
 class Emulator:
@@ -31,11 +32,10 @@ class Emulator:
         self._scale = np.array(scenario.actuators.scale)
         self._endpoint = endpoint
         self._truth = truth
-        self._position = PositionSensor(scenario.noise, scenario.seed)
         self._inertial = InertialSensors(scenario.body.mass, scenario.world)
-        self._command = np.zeros(6)
-        self._tick = TickWriter(endpoint.writer)
-        self._unrecorded = np.zeros(31)
+        self._quick = QuickTicks(scenario, self.plant, self.safety, endpoint.writer, endpoint.reader)
+        self._row = np.zeros(31)
+        self._quiet_until_ns = 0
         self._heartbeat = Due(stream("HEARTBEAT").rate_hz or 1.0)
         self._gps = Due(stream("HIL_GPS").rate_hz or 1.0)
         self.counters = {"refused_commands": 0}
@@ -49,8 +49,8 @@ class Emulator:
         if self._gps.at(t_ns):
             place = self._inertial.geodetic(state.motion)
             frames.append(seal(mavlink_map.GPS, mavlink_map.encode_gps(t_ns, *place, state.motion[6:9])))
-        sample = self._position.measure(t_ns, state.motion)
-        frames.extend(self._tick.frames(t_ns, sample.q, self._inertial.measure(state.motion, state.u)))
+        frames.extend(self._quick.frames(t_ns))
+        self._quiet_until_ns = min(self._heartbeat.next_ns, self._gps.next_ns)
         return frames
 
     def decode(self, payload: bytes) -> ActuatorCommand | None:
@@ -60,13 +60,33 @@ class Emulator:
             self.counters["refused_commands"] += 1
         return command
 
-    def decode_answer(self, datagram: bytes, t_ns: int) -> ActuatorCommand | None:
-        """The command in a datagram that holds just the answer to the tick at t_ns; None where it is anything else."""
-        return read_command(datagram, VEHICLE, self._endpoint.reader, self._scale, t_ns)
+    def go_on(self, datagram: bytes, t_ns: int, end_ns: int, delay_ns: int) -> tuple[bytes, int] | None:
+        """`act`, `advance` and `sense` at once, where the datagram is just the armed answer to the tick at t_ns.
+
+        Returns the two frames of the tick at end_ns as one, and where the first ends; send them, then `settle`. None, with
+        nothing done, where the datagram is anything else or other frames are due too. Raises DivergenceError, the tick's row
+        being recorded.
+        """
+        if end_ns >= self._quiet_until_ns:
+            return None
+        try:
+            return self._quick.go_on(datagram, self._row, t_ns, end_ns, delay_ns)
+        except DivergenceError:
+            self._record(t_ns)
+            raise
+
+    def settle(self, t_ns: int) -> None:
+        """What is left to do after `go_on`, while the next tick is on its way."""
+        self._quick.settle(t_ns)
+        self._record(t_ns)
+
+    def _record(self, t_ns: int) -> None:
+        if self._truth:
+            self._truth.append(t_ns, self._row)
 
     def act(self, arrival_ns: int, delay_ns: int, command: ActuatorCommand) -> None:
         """Let a command that arrived at simulation time arrival_ns act delay_ns later, within the safety envelope."""
-        self._command = command.tau
+        self._quick.newest[:] = command.tau
         self.plant.command(arrival_ns + delay_ns, self.safety.accept(arrival_ns, command))
 
     def check_staleness(self, t_ns: int) -> None:
@@ -79,8 +99,10 @@ class Emulator:
     def advance(self, end_ns: int) -> None:
         """Record the tick and integrate to the next one. Raises DivergenceError, the tick's row being recorded."""
         t_ns = self.plant.t_ns
-        row = self._truth.next_row(t_ns) if self._truth else self._unrecorded
-        self.plant.record_and_advance(end_ns, self._command, row)
+        try:
+            self.plant.record_and_advance(end_ns, self._quick.newest, self._row)
+        finally:
+            self._record(t_ns)
 
     def flush(self) -> None:
         """Hand the ground truth so far to the system."""

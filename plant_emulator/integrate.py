@@ -251,14 +251,15 @@ class Plant:
 
     def advance(self, end_ns: int) -> None:
         """Integrate up to end_ns. Raises DivergenceError; the state is then the last one computed."""
-        self._arrive(end_ns, _advance_packed(self.state.packed, self.parameters, self.t_ns, end_ns))
+        self.arrive(end_ns, _advance_packed(self.state.packed, self.parameters, self.t_ns, end_ns))
 
     def record_and_advance(self, end_ns: int, command: FloatArray, row: FloatArray) -> None:
         """Let the commands act whose time is now, fill the row (31,) of this moment (see `fill_row`), then `advance`."""
         outcome = _record_and_advance_packed(self.state.packed, self.parameters, self.t_ns, end_ns, command, row)
-        self._arrive(end_ns, outcome)
+        self.arrive(end_ns, outcome)
 
-    def _arrive(self, end_ns: int, outcome: int) -> None:
+    def arrive(self, end_ns: int, outcome: int) -> None:
+        """Take note that a kernel has moved the state to end_ns. Raises DivergenceError where its outcome says so."""
         if outcome != GOES_ON:
             raise DivergenceError(divergence_sentence(outcome, end_ns))
         self.t_ns = end_ns

@@ -6,6 +6,7 @@ A pacing carries one tick across the link and gives the plant the commands that 
 from __future__ import annotations
 
 import abc
+from collections.abc import Sequence
 
 from bridge.clock import Clock, unix_time_us
 from bridge.endpoint import VEHICLE, Endpoint
@@ -13,9 +14,8 @@ from bridge.process import StopFlag
 from bridge.rate import RateKeeper
 from plant_emulator.emulator import Emulator
 from protocol import mavlink_map
-from protocol.errors import PeerLostError
+from protocol.errors import DivergenceError, PeerLostError
 from protocol.mavlink_codec import Frame
-from protocol.messages import ActuatorCommand
 from protocol.streams import HEARTBEAT_TIMEOUT_NS
 from protocol.tlog import TlogWriter
 
@@ -31,25 +31,33 @@ class Pacing(abc.ABC):
     """
 
     def __init__(
-        self, emulator: Emulator, endpoint: Endpoint, log: TlogWriter | None, clock: Clock, stop: StopFlag
+        self,
+        emulator: Emulator,
+        endpoint: Endpoint,
+        log: TlogWriter | None,
+        clock: Clock,
+        stop: StopFlag,
+        period_ns: int,
     ) -> None:
         self.emulator = emulator
         self.endpoint = endpoint
         self.log = log
         self.clock = clock
         self.stop = stop
+        self.period_ns = period_ns
         self.latencies_ns: list[int] = []
         self.counters: dict[str, int] = {}
-        self._owed: list[tuple[int, list[bytes]]] = []
+        self._owed: list[tuple[int, Sequence[bytes]]] = []
 
     @abc.abstractmethod
     def exchange(self, tick: int, t_ns: int) -> None:
-        """Send the tick at simulation time t_ns and hand what comes of it to the emulator.
+        """Send the tick at simulation time t_ns, hand what comes of it to the emulator, and move that to the next tick.
 
-        Raises PeerLostError where the controller fell silent, Interrupted where the user asked to stop.
+        Raises PeerLostError where the controller fell silent, Interrupted where the user asked to stop, DivergenceError
+        where the plant cannot go on; the tick's row is then recorded.
         """
 
-    def owe_log(self, t_us: int, frames: list[bytes]) -> None:
+    def owe_log(self, t_us: int, frames: Sequence[bytes]) -> None:
         """Have frames logged under one time, at the next `settle_log`."""
         self._owed.append((t_us, frames))
 
@@ -86,56 +94,68 @@ class Lockstep(Pacing):
         log: TlogWriter | None,
         clock: Clock,
         stop: StopFlag,
+        period_ns: int,
         *,
+        ticks: int,
         delay_ns: int,
         keeper: RateKeeper | None,
     ) -> None:
-        super().__init__(emulator, endpoint, log, clock, stop)
+        super().__init__(emulator, endpoint, log, clock, stop, period_ns)
         self._delay_ns = delay_ns
         self._keeper = keeper
+        self._ahead_until_ns = 0 if keeper else ticks * period_ns
+        """Ticks before this time may leave the moment the answer to the one before them is there."""
+        self._sent_ns = self._answered_ns = 0
+        self._datagram = b""
+        self._is_sent = False
         self.counters = {"resent": 0, "foreign": 0}
 
     def exchange(self, tick: int, t_ns: int) -> None:
         """One tick out, its one answer back."""
         self.stop.check()
-        if self._keeper:
-            if tick == 0:
-                self._keeper.start()
-            self._keeper.sleep()
-            self._keeper.tick()
-            self.counters.update(self._keeper.counters)
-        frames = self.emulator.sense(t_ns)
-        datagram = b"".join(frames)
-        t_us = t_ns // 1000
-        self.owe_log(t_us, frames)
-        sent_ns = self.clock.now_ns()
+        if not self._is_sent:
+            self._pace(tick)
+            frames = self.emulator.sense(t_ns)
+            self._send(b"".join(frames))
+            self.owe_log(t_ns // 1000, frames)
+        self._is_sent = False
+        self.settle_log()
         received: list[Frame] = []
         for attempt, wait_s in enumerate(RESEND_AFTER_S):
             if attempt:
                 self.counters["resent"] += 1
                 self.stop.check()
-            self.endpoint.link.send(datagram)
-            self.settle_log()
-            command = self._await_answer(t_ns, round(wait_s * 1e9), received)
-            if command is not None:
-                self.latencies_ns.append(self.clock.now_ns() - sent_ns)
-                self._accept(tick, t_us, received)
-                self.emulator.act(t_ns, self._delay_ns, command)
+                self.endpoint.link.send(self._datagram)
+            if self._await_answer(tick, t_ns, round(wait_s * 1e9), received):
                 return
         raise PeerLostError(
             f"the controller at {self.endpoint.link.peer} gave no answer to the tick at t = {t_ns * 1e-9:.3f} s for 2 s: "
             "see whether it still runs"
         )
 
-    def _await_answer(self, t_ns: int, wait_ns: int, received: list[Frame]) -> ActuatorCommand | None:
-        """The command that answers the tick, None where it did not come in time; `received` gathers its frames."""
+    def _pace(self, tick: int) -> None:
+        """Wait for the tick's time, where there is a speed to keep."""
+        if self._keeper:
+            if tick == 0:
+                self._keeper.start()
+            self._keeper.sleep()
+            self._keeper.tick()
+            self.counters.update(self._keeper.counters)
+
+    def _send(self, datagram: bytes) -> None:
+        self._sent_ns = self.clock.now_ns()
+        self.endpoint.link.send(datagram)
+        self._datagram = datagram
+
+    def _await_answer(self, tick: int, t_ns: int, wait_ns: int, received: list[Frame]) -> bool:
+        """Whether the answer to the tick came in time; the plant has then moved on. `received` gathers its frames."""
         deadline_ns = self.clock.now_ns() + wait_ns
         timeout_s = wait_ns * 1e-9
         while True:
             data = self.endpoint.link.recv(timeout_s)
-            if data and not received and (command := self.emulator.decode_answer(data, t_ns)):
-                received.append(Frame(mavlink_map.COMMAND.message_id, data[4], *VEHICLE, b"", data))
-                return command
+            if data and not received and self._go_on(data, t_ns):
+                return True
+            self._answered_ns = self.clock.now_ns()
             frames = self.endpoint.reader.read(data) if data else []
             for frame in frames:
                 received.append(frame)
@@ -143,14 +163,40 @@ class Lockstep(Pacing):
                     continue
                 command = self.emulator.decode(frame.payload)
                 if command is not None and command.t_ns == t_ns:
-                    return command
+                    self.latencies_ns.append(self._answered_ns - self._sent_ns)
+                    self._accept(tick, t_ns // 1000, received)
+                    self.emulator.act(t_ns, self._delay_ns, command)
+                    self.emulator.advance(t_ns + self.period_ns)
+                    return True
                 # A late copy of an earlier answer: neither it nor what came with it belongs to this tick.
                 self.counters["foreign"] += len(received)
                 received.clear()
             remaining_ns = deadline_ns - self.clock.now_ns()
             if (timeout_s == 0.0 and not data) or remaining_ns < -wait_ns:
-                return None
+                return False
             timeout_s = max(0.0, remaining_ns * 1e-9)  # at 0 one last look: the machine may have stalled
+
+    def _go_on(self, data: bytes, t_ns: int) -> bool:
+        """Take a plain answer and send the next tick, which is plain too, at once: all else waits until it is on its way."""
+        end_ns = t_ns + self.period_ns
+        if end_ns >= self._ahead_until_ns:
+            return False
+        answered_ns = self.clock.now_ns()
+        try:
+            following = self.emulator.go_on(data, t_ns, end_ns, self._delay_ns)
+        except DivergenceError:
+            self.owe_log(t_ns // 1000, [data])
+            raise
+        if following is None:
+            return False
+        datagram, middle = following
+        self.latencies_ns.append(answered_ns - self._sent_ns)
+        self._send(datagram)
+        self._is_sent = True
+        self.emulator.settle(t_ns)
+        self.owe_log(t_ns // 1000, [data])
+        self.owe_log(end_ns // 1000, (datagram[:middle], datagram[middle:]))
+        return True
 
     def _accept(self, tick: int, t_us: int, frames: list[Frame]) -> None:
         """Log the frames of an answer. Numbers restart at t = 0, so the first answer's own tells how many belong to it."""
@@ -182,12 +228,10 @@ class RealTime(Pacing):
         log: TlogWriter | None,
         clock: Clock,
         stop: StopFlag,
-        *,
         period_ns: int,
     ) -> None:
-        super().__init__(emulator, endpoint, log, clock, stop)
+        super().__init__(emulator, endpoint, log, clock, stop, period_ns)
         self._keeper = RateKeeper(clock, period_ns)
-        self._period_ns = period_ns
         self._sent: dict[int, int] = {}
         self._newest_ns = -1
         self._begun = False
@@ -217,18 +261,19 @@ class RealTime(Pacing):
             received = self.endpoint.receive(remaining_ns * 1e-9)
             arrived_ns = self.clock.now_ns()
             for frame in received:
-                since_tick_ns = min(max(0, arrived_ns - begun_ns), self._period_ns)
+                since_tick_ns = min(max(0, arrived_ns - begun_ns), self.period_ns)
                 self._take(frame, t_ns + since_tick_ns, arrived_ns)
         self._keeper.tick()
         self.counters.update(self._keeper.counters)
         if self._newest_ns < t_ns:
             self.counters["unanswered"] += 1
-        self.emulator.check_staleness(t_ns + self._period_ns)
+        self.emulator.check_staleness(t_ns + self.period_ns)
         if self.clock.now_ns() - self._heard_ns > HEARTBEAT_TIMEOUT_NS:
             raise PeerLostError(
                 f"the controller at {self.endpoint.link.peer} fell silent at t = {t_ns * 1e-9:.3f} s, 3 s without a "
                 "heartbeat or command: see whether it still runs"
             )
+        self.emulator.advance(t_ns + self.period_ns)
 
     def _take(self, frame: Frame, arrival_ns: int, wall_ns: int) -> None:
         self.owe_log(unix_time_us(), [frame.raw])

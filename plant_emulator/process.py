@@ -87,7 +87,7 @@ def warm_up(scenario: Scenario) -> None:
         emulator.decode(mavlink_map.encode_command(command, np.ones(6), lockstep=True))
         emulator.act(0, 0, command)
         emulator.advance(scenario.period_ns)
-        emulator.decode_answer(b"", 0)
+        emulator.go_on(b"", 0, 1, 0)
 
 
 def _pacing(
@@ -100,9 +100,12 @@ def _pacing(
     stop: StopFlag,
 ) -> Pacing:
     if options.clock == "realtime":
-        return RealTime(emulator, endpoint, log, clock, stop, period_ns=scenario.period_ns)
+        return RealTime(emulator, endpoint, log, clock, stop, scenario.period_ns)
     keeper = RateKeeper(clock, round(scenario.period_ns / options.speed)) if options.speed else None
-    return Lockstep(emulator, endpoint, log, clock, stop, delay_ns=scenario.delay_ns, keeper=keeper)
+    return Lockstep(
+        emulator, endpoint, log, clock, stop, scenario.period_ns,
+        ticks=scenario.ticks, delay_ns=scenario.delay_ns, keeper=keeper,
+    )  # fmt: skip
 
 
 def _meet_controller(scenario: Scenario, options: EmulatorOptions, endpoint: Endpoint, stop: StopFlag) -> None:
@@ -160,7 +163,6 @@ def _run_ticks(
         for tick in range(scenario.ticks):
             t_ns = tick * period_ns
             pacing.exchange(tick, t_ns)
-            emulator.advance(t_ns + period_ns)
             done = tick + 1
             now_ns = clock.now_ns()
             ticks_ns.append(now_ns - last_ns)

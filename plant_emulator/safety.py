@@ -29,14 +29,15 @@ def clamp(tau: FloatArray, lower: FloatArray, upper: FloatArray, allowed: FloatA
 class SafetyEnvelope:
     """Limits, arming and staleness.
 
+    lower, upper   (6,) the limits
     counters   clamped   commands that were beyond a limit
                disarmed  commands that came without arming
                stale     times the output went to its safe value because no command came within staleness_s
     """
 
     def __init__(self, actuators: Actuators) -> None:
-        self._lower = np.array(actuators.lower)
-        self._upper = np.array(actuators.upper)
+        self.lower = np.array(actuators.lower)
+        self.upper = np.array(actuators.upper)
         self._safe = np.array(actuators.safe)
         self._staleness_ns = round(actuators.staleness_s * NANOSECONDS)
         self._last_ns: int | None = 0  # from t = 0 on a first command is awaited, like any other
@@ -44,14 +45,19 @@ class SafetyEnvelope:
 
     def accept(self, t_ns: int, command: ActuatorCommand) -> FloatArray:
         """What the motors get of a command that came at simulation time t_ns: tau (6,)."""
-        self._last_ns = t_ns
         if not command.armed:
+            self._last_ns = t_ns
             self.counters["disarmed"] += 1
             return np.zeros(6)
         allowed = np.empty(6)
-        if clamp(command.tau, self._lower, self._upper, allowed) > _TOLERANCE:
-            self.counters["clamped"] += 1
+        self.accepted(t_ns, clamp(command.tau, self.lower, self.upper, allowed))
         return allowed
+
+    def accepted(self, t_ns: int, excess: float) -> None:
+        """Take note of an armed command of that time and excess over the limits, clamped by `clamp`."""
+        self._last_ns = t_ns
+        if excess > _TOLERANCE:
+            self.counters["clamped"] += 1
 
     def stale_output(self, t_ns: int) -> tuple[int, FloatArray] | None:
         """(time it begins to act, safe tau) once per outage, where the last command is too old at t_ns; else None."""

@@ -47,19 +47,23 @@ class PositionSensor:
         """The standard normal numbers (count, 6) of the next `count` ticks."""
         return self._generator.standard_normal((count, 6))
 
-    def measure(self, t_ns: int, motion: FloatArray) -> PositionSample:
-        """The sample of this tick; call it once for every tick."""
+    def next_normal(self) -> FloatArray:
+        """The standard normal numbers (6,) of the next tick; ask once for every tick."""
         if self._at == len(self._block):
             self._block = self.draw(_BLOCK)
             self._at = 0
-        q = np.empty(6)
-        add_noise(motion, self._block[self._at], self._noise.position, self._noise.attitude, q)
         self._at += 1
+        return np.asarray(self._block[self._at - 1])
+
+    def measure(self, t_ns: int, motion: FloatArray) -> PositionSample:
+        """The sample of the next tick."""
+        q = np.empty(6)
+        add_noise(motion, self.next_normal(), self._noise.position, self._noise.attitude, q)
         return PositionSample(t_ns, q)
 
 
 @compiled
-def _inertial_readings(
+def inertial_readings(
     motion: FloatArray, u: FloatArray, mass: float, field: FloatArray, altitude: float, readings: FloatArray
 ) -> None:
     """Fill readings (13,) but the last; altitude is that of the origin."""
@@ -92,7 +96,7 @@ class InertialSensors:
 
     def measure(self, motion: FloatArray, u: FloatArray) -> FloatArray:
         """The readings (13,) that `mavlink_map.encode_tick` takes; the next call overwrites them."""
-        _inertial_readings(motion, u, self._mass, self._field, self._world.altitude, self._readings)
+        inertial_readings(motion, u, self._mass, self._field, self._world.altitude, self._readings)
         return self._readings
 
     def geodetic(self, motion: FloatArray) -> tuple[float, float, float]:

@@ -50,17 +50,13 @@ class TruthWriter:
             self._file.close()
             raise RunFolderError(f"cannot write the ground truth {path}: {error.strerror}") from None
 
-    def next_row(self, t_ns: int) -> FloatArray:
-        """The numbers (31,) of a new row at time t_ns, for the caller to fill from its second on; see `integrate.fill_row`.
-
-        The row is on its way to disk from the next call, or a flush, on.
-        """
+    def append(self, t_ns: int, row: FloatArray) -> None:
+        """Add the row of time t_ns: the numbers (31,) of `integrate.fill_row`, whose first is left out."""
         if self._pending == _BLOCK:
             self.flush()
-        row = self._numbers[self._pending]
+        self._numbers[self._pending] = row
         self._times[self._pending] = t_ns
         self._pending += 1
-        return np.asarray(row)
 
     def flush(self) -> None:
         """Write what is pending and make the header say so."""

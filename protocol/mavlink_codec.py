@@ -236,19 +236,13 @@ class FrameReader:
             self._follow(system, component, sequence)
         return Frame(number, sequence, system, component, data[at + HEADER_V2 : stop], data[at : at + size])
 
-    def follows(self, system: int, component: int, sequence: int, count: int) -> bool:
-        """Take note of `count` frames in a row that were read elsewhere; False where they are not the ones expected next.
+    def expected(self, sender: tuple[int, int]) -> int:
+        """The number of the next frame of a (system, component); -1 where it is not followed, or a frame is half read."""
+        return -1 if self._rest else self._next.get(sender, -1)
 
-        False changes nothing: `read` the bytes then, and what is amiss is counted.
-        """
-        if self._rest:
-            return False
-        if self._follow_sequence:
-            key = (system, component)
-            if self._next.get(key) != sequence:
-                return False
-            self._next[key] = (sequence + count) & 0xFF
-        return True
+    def expect(self, sender: tuple[int, int], number: int) -> None:
+        """Have `number` expected next of a sender whose frames were read elsewhere."""
+        self._next[sender] = number & 0xFF
 
     def _follow(self, system: int, component: int, sequence: int) -> None:
         key = (system, component)

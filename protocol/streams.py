@@ -56,17 +56,20 @@ def stream(message: str) -> Stream:
 
 
 class Due:
-    """Says when a periodic stream is due, in the time it is asked with: first at once, then each period."""
+    """Says when a periodic stream is due, in the time it is asked with: first at once, then each period.
+
+    next_ns   until then it is not due
+    """
 
     def __init__(self, rate_hz: float) -> None:
         self._period_ns = round(NANOSECONDS / rate_hz)
-        self._next_ns: int | None = None
+        self.next_ns = 0
 
     def at(self, t_ns: int) -> bool:
         """Whether the stream is due at `t_ns`; asking so also marks it as sent."""
-        if self._next_ns is not None and t_ns < self._next_ns:
+        if t_ns < self.next_ns:
             return False
-        self._next_ns = (t_ns // self._period_ns + 1) * self._period_ns
+        self.next_ns = (t_ns // self._period_ns + 1) * self._period_ns
         return True
 
 

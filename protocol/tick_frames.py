@@ -1,8 +1,9 @@
 """The frames of a tick, whole, in compiled code: pose and tick one way, the command the other.
 
 The mapping is `mavlink_map`'s, the frames are byte for byte those of `mavlink_codec`. Reading takes the plain case only, a
-datagram that holds just these frames, intact and from the sender expected; for anything else it says so (None), and the
-caller reads the datagram with the codec, which counts what is amiss.
+datagram that holds just these frames, intact and from the sender expected; for anything else it says so (-1), and the
+caller reads the datagram with the codec, which counts what is amiss. The kernels are called by those of either end, which
+do all of their part of a tick in one call.
 """
 
 from __future__ import annotations
@@ -11,9 +12,8 @@ import numpy as np
 
 from protocol.compiled import Packed, compiled
 from protocol.frame_kernels import Bytes, plain_frame, read_uint64, seal_frame
-from protocol.mavlink_codec import LONGEST_FRAME, FrameReader, FrameWriter
+from protocol.mavlink_codec import LONGEST_FRAME, FrameWriter
 from protocol.mavlink_map import (
-    ARMED,
     COMMAND,
     COMMAND_MODE,
     POSE,
@@ -26,7 +26,7 @@ from protocol.mavlink_map import (
     pose_of_values,
     tau_of_controls,
 )
-from protocol.messages import ActuatorCommand, FloatArray, PositionSample
+from protocol.messages import ActuatorCommand, FloatArray
 
 _POSE_ID, _POSE_SEED = POSE.message_id, POSE.crc_seed[0]
 _TICK_ID, _TICK_SEED = TICK.message_id, TICK.crc_seed[0]
@@ -35,7 +35,7 @@ _HEADER = 10
 
 
 @compiled
-def _write_tick(
+def write_tick(
     pose: Packed, pose_payload: Bytes, tick: Packed, tick_payload: Bytes, out: Bytes, t_us: int, q: FloatArray,
     readings: FloatArray, sequence: int, system: int, component: int,
 ) -> tuple[int, int]:  # fmt: skip
@@ -48,16 +48,17 @@ def _write_tick(
 
 
 @compiled
-def _write_command(
+def write_command(
     command: Packed, payload: Bytes, out: Bytes, t_us: int, tau: FloatArray, scale: FloatArray, armed: bool,
     lockstep: bool, sequence: int, system: int, component: int,
 ) -> int:  # fmt: skip
+    """The frame into `out`; returns where it ends."""
     fill_command(command[0], t_us, tau, scale, armed, lockstep)
     return seal_frame(out, 0, payload, sequence, system, component, _COMMAND_ID, _COMMAND_SEED)
 
 
 @compiled
-def _read_tick(data: Bytes, system: int, component: int, q: FloatArray) -> tuple[int, int]:
+def parse_tick(data: Bytes, system: int, component: int, q: FloatArray) -> tuple[int, int]:
     """(time in us, number of the first frame) of a datagram of pose and tick, q (6,) filled; (-1, 0) if it is not one."""
     middle = plain_frame(data, 0, system, component, _POSE_ID, POSE_READ, _POSE_SEED)
     if middle < 0:
@@ -74,7 +75,7 @@ def _read_tick(data: Bytes, system: int, component: int, q: FloatArray) -> tuple
 
 
 @compiled
-def _read_command(data: Bytes, system: int, component: int, scale: FloatArray, tau: FloatArray) -> tuple[int, int, int]:
+def parse_command(data: Bytes, system: int, component: int, scale: FloatArray, tau: FloatArray) -> tuple[int, int, int]:
     """(time in us, number, mode) of a datagram of one command, tau (6,) filled; (-1, 0, 0) if it is not one."""
     end = plain_frame(data, 0, system, component, _COMMAND_ID, COMMAND_MODE + 1, _COMMAND_SEED)
     if end != data.shape[0]:
@@ -85,62 +86,57 @@ def _read_command(data: Bytes, system: int, component: int, scale: FloatArray, t
 
 
 class TickWriter:
-    """Seals the two frames of a tick with a component's own `FrameWriter`."""
+    """Seals the two frames of a tick with a component's own `FrameWriter`.
+
+    buffers   what `write_tick` takes first, for a kernel that measures and writes in one call
+    """
 
     def __init__(self, writer: FrameWriter) -> None:
         self._writer = writer
-        self._pose, self._tick = np.zeros(1, POSE.dtype), np.zeros(1, TICK.dtype)
-        self._structures = (self._pose, self._pose.view(np.uint8), self._tick, self._tick.view(np.uint8))
+        pose, tick = np.zeros(1, POSE.dtype), np.zeros(1, TICK.dtype)
         self._out = np.zeros(2 * LONGEST_FRAME, dtype=np.uint8)
+        self.buffers = (pose, pose.view(np.uint8), tick, tick.view(np.uint8), self._out)
 
     def frames(self, t_ns: int, q: FloatArray, readings: FloatArray) -> tuple[bytes, bytes]:
         """ATT_POS_MOCAP and HIL_SENSOR of the measured q (6,) and the readings (13,) of `mavlink_map.encode_tick`."""
         writer = self._writer
-        middle, end = _write_tick(
-            *self._structures, self._out, t_ns // 1000, q, readings, writer.sequence, writer.system, writer.component
+        middle, end = write_tick(
+            *self.buffers, t_ns // 1000, q, readings, writer.sequence, writer.system, writer.component
         )
-        writer.sequence = (writer.sequence + 2) & 0xFF
-        sealed = self._out[:end].tobytes()
+        sealed = self.taken(end)
         return sealed[:middle], sealed[middle:]
+
+    def taken(self, end: int) -> bytes:
+        """Both frames, which a kernel has written into the buffers with the writer's next two numbers."""
+        self._writer.sequence = (self._writer.sequence + 2) & 0xFF
+        return self._out[:end].tobytes()
 
 
 class CommandWriter:
-    """Seals the frame of a command with a component's own `FrameWriter`."""
+    """Seals the frame of a command with a component's own `FrameWriter`.
+
+    buffers   what `write_command` takes first, for a kernel that computes and writes in one call
+    """
 
     def __init__(self, writer: FrameWriter, scale: FloatArray, *, lockstep: bool) -> None:
         self._writer = writer
         self._scale = scale
         self._lockstep = lockstep
-        self._command = np.zeros(1, COMMAND.dtype)
-        self._payload = self._command.view(np.uint8)
+        command = np.zeros(1, COMMAND.dtype)
         self._out = np.zeros(LONGEST_FRAME, dtype=np.uint8)
+        self.buffers = (command, command.view(np.uint8), self._out)
 
     def frame(self, command: ActuatorCommand) -> bytes:
         """HIL_ACTUATOR_CONTROLS of a command."""
         writer = self._writer
-        end = _write_command(
-            self._command, self._payload, self._out, command.t_ns // 1000, command.tau, self._scale, command.armed,
-            self._lockstep, writer.sequence, writer.system, writer.component,
+        return self.taken(
+            write_command(
+                *self.buffers, command.t_ns // 1000, command.tau, self._scale, command.armed, self._lockstep,
+                writer.sequence, writer.system, writer.component,
+            )
         )  # fmt: skip
-        writer.sequence = (writer.sequence + 1) & 0xFF
+
+    def taken(self, end: int) -> bytes:
+        """The frame that a kernel has written into the buffers with the writer's next number, ending there."""
+        self._writer.sequence = (self._writer.sequence + 1) & 0xFF
         return self._out[:end].tobytes()
-
-
-def read_tick(data: bytes, sender: tuple[int, int], reader: FrameReader) -> PositionSample | None:
-    """The sample in a datagram of just a pose and its tick; None where it is anything else."""
-    q = np.empty(6)
-    t_us, sequence = _read_tick(np.frombuffer(data, np.uint8), *sender, q)
-    if t_us < 0 or not reader.follows(*sender, sequence, 2):
-        return None
-    return PositionSample(t_us * 1000, q)
-
-
-def read_command(
-    data: bytes, sender: tuple[int, int], reader: FrameReader, scale: FloatArray, t_ns: int
-) -> ActuatorCommand | None:
-    """The command in a datagram of just the answer to the tick at t_ns; None where it is anything else."""
-    tau = np.empty(6)
-    t_us, sequence, mode = _read_command(np.frombuffer(data, np.uint8), *sender, scale, tau)
-    if t_us < 0 or t_us * 1000 != t_ns or not reader.follows(*sender, sequence, 1):
-        return None
-    return ActuatorCommand(t_ns, tau, mode & ARMED != 0)

@@ -36,7 +36,9 @@ def append(writer: TruthWriter, plant: Plant, ticks: range) -> None:
         state.motion[:] = 1000.0 * k + np.arange(12)
         state.tau[:] = 1000.0 * k + 100.0 + np.arange(6)
         state.u[:] = 1000.0 * k + 200.0 + np.arange(6)
-        fill_row(state, 1000.0 * k + 300.0 + np.arange(6.0), writer.next_row(4_000_000 * k))
+        row = np.full(31, np.nan)
+        fill_row(state, 1000.0 * k + 300.0 + np.arange(6.0), row)
+        writer.append(4_000_000 * k, row)
 
 
 def assert_rows(path: Path, count: int) -> None:

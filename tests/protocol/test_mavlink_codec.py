@@ -511,36 +511,36 @@ class TestSequence:
         reader.read(_numbered([20, 22, 20]))
         assert reader.counters == ZEROS | {"sequence_gaps": 1, "out_of_order": 1}
 
-    def test_frames_read_elsewhere_are_followed_where_they_are_the_next(self) -> None:
+    def test_frames_read_elsewhere_are_followed_from_the_number_said(self) -> None:
         reader = FrameReader(is_datagram=True)
         reader.read(_numbered([254]))
-        assert reader.follows(1, 1, 255, 2)
-        assert reader.follows(1, 1, 1, 1)
+        reader.expect((1, 1), 258)
+        assert reader.expected((1, 1)) == 2
         reader.read(_numbered([2, 4]))
         assert reader.counters == ZEROS | {"sequence_gaps": 1}
 
-    @pytest.mark.parametrize(("component", "sequence"), [(1, 41), (1, 39), (1, 168), (2, 40)])
-    def test_frames_read_elsewhere_that_are_not_the_next_change_nothing(self, component: int, sequence: int) -> None:
+    def test_the_number_expected_next_is_that_after_the_last_frame_and_wraps(self) -> None:
         reader = FrameReader(is_datagram=True)
-        reader.read(_numbered([39]))
-        assert not reader.follows(1, component, sequence, 2)
-        reader.read(_numbered([40]))
-        assert reader.counters == ZEROS
+        assert reader.expected((1, 1)) == -1
+        reader.read(_numbered([254, 255]))
+        assert reader.expected((1, 1)) == 0
+        assert reader.expected((1, 2)) == -1
 
-    def test_while_a_frame_is_incomplete_none_can_be_read_elsewhere_and_nothing_changes(self) -> None:
+    def test_while_a_frame_is_incomplete_no_number_is_expected_and_nothing_changes(self) -> None:
         reader = FrameReader(is_datagram=False)
         whole = _numbered([7, 8, 9])
         reader.read(whole[:-5])
-        assert not reader.follows(1, 1, 9, 1)
+        assert reader.expected((1, 1)) == -1
         assert [frame.sequence for frame in reader.read(whole[-5:])] == [9]
+        assert reader.expected((1, 1)) == 10
         assert reader.counters == ZEROS
 
-    def test_without_following_any_number_may_be_read_elsewhere(self) -> None:
+    def test_without_following_no_number_is_expected_until_numbers_restart(self) -> None:
         reader = FrameReader(is_datagram=True, follow_sequence=False)
-        assert reader.follows(1, 1, 77, 2)
-        assert reader.follows(1, 1, 3, 2)
-        reader.restart_sequences()
-        assert not reader.follows(1, 1, 5, 2)
+        reader.read(_numbered([7]))
+        assert reader.expected((1, 1)) == -1
+        reader.restart_sequences([(1, 1, 256)])
+        assert reader.expected((1, 1)) == 0
 
     def test_a_bad_frame_does_not_move_the_count(self) -> None:
         bad = bytearray(_numbered([50]))

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from protocol import mavlink_map
-from protocol.mavlink_codec import FrameReader, FrameWriter
-from protocol.messages import ActuatorCommand
-from protocol.tick_frames import CommandWriter, TickWriter, read_command, read_tick
+from protocol.mavlink_codec import FrameWriter
+from protocol.messages import ActuatorCommand, FloatArray
+from protocol.tick_frames import CommandWriter, TickWriter, parse_command, parse_tick
 
 EMULATOR, VEHICLE = (1, 191), (1, 1)
 SCALE = np.array([0.04, 0.04, 0.12, 3e-4, 3e-4, 3e-4])
@@ -33,8 +33,16 @@ def command_datagram(t_ns: int = 5_000_000) -> bytes:
     )
 
 
-def new_reader() -> FrameReader:
-    return FrameReader(is_datagram=True, follow_sequence=False)
+def read_tick(datagram: bytes, sender: tuple[int, int] = EMULATOR) -> tuple[int, int, FloatArray]:
+    """Time in us, number of the first frame and q; the time is -1 where the datagram is not plain."""
+    q = np.empty(6)
+    return *parse_tick(np.frombuffer(datagram, np.uint8), *sender, q), q
+
+
+def read_command(datagram: bytes, sender: tuple[int, int] = VEHICLE) -> tuple[int, int, int, FloatArray]:
+    """Time in us, number, mode and tau; the time is -1 where the datagram is not plain."""
+    tau = np.empty(6)
+    return *parse_command(np.frombuffer(datagram, np.uint8), *sender, SCALE, tau), tau
 
 
 @settings(max_examples=60)
@@ -52,13 +60,11 @@ def test_the_frames_of_a_tick_are_the_codec_s_to_the_byte(
     )
     assert TickWriter(fast).frames(t_ns, q, readings) == expected
     assert fast.sequence == slow.sequence
-    sample, slow_sample = (
-        read_tick(b"".join(expected), EMULATOR, new_reader()),
-        mavlink_map.decode_pose(mavlink_map.encode_pose(t_ns, q)),
-    )
-    assert sample is not None and slow_sample is not None  # noqa: PT018  (both for the type checker)
-    assert sample.t_ns == slow_sample.t_ns
-    assert np.array_equal(sample.q, slow_sample.q)
+    t_us, number, read = read_tick(b"".join(expected))
+    slow_sample = mavlink_map.decode_pose(mavlink_map.encode_pose(t_ns, q))
+    assert slow_sample is not None
+    assert (t_us * 1000, number) == (slow_sample.t_ns, start)
+    assert np.array_equal(read, slow_sample.q)
 
 
 @settings(max_examples=60)
@@ -70,46 +76,50 @@ def test_the_frame_of_a_command_is_the_codec_s_to_the_byte(
     payload = mavlink_map.encode_command(command, SCALE, lockstep=lockstep)
     expected = FrameWriter(*VEHICLE).seal(mavlink_map.COMMAND, payload)
     assert CommandWriter(FrameWriter(*VEHICLE), SCALE, lockstep=lockstep).frame(command) == expected
-    read, slow = read_command(expected, VEHICLE, new_reader(), SCALE, t_ns), mavlink_map.decode_command(payload, SCALE)
-    assert read is not None and slow is not None  # noqa: PT018
-    assert (read.t_ns, read.armed) == (slow.t_ns, slow.armed)
-    assert np.array_equal(read.tau, slow.tau)
+    slow = mavlink_map.decode_command(payload, SCALE)
+    t_us, number, mode, read = read_command(expected)
+    assert slow is not None
+    assert (t_us * 1000, number, mode & mavlink_map.ARMED != 0) == (slow.t_ns, 0, slow.armed)
+    assert np.array_equal(read, slow.tau)
 
 
 def test_a_datagram_cut_short_or_followed_by_more_is_left_to_the_codec() -> None:
     tick, command = tick_datagram(), command_datagram()
     for size in range(len(tick)):
-        assert read_tick(tick[:size], EMULATOR, new_reader()) is None
+        assert read_tick(tick[:size])[0] == -1
     for size in range(len(command)):
-        assert read_command(command[:size], VEHICLE, new_reader(), SCALE, 5_000_000) is None
-    assert read_tick(tick + b"\xfd", EMULATOR, new_reader()) is None
-    assert read_command(command + command, VEHICLE, new_reader(), SCALE, 5_000_000) is None
+        assert read_command(command[:size])[0] == -1
+    assert read_tick(tick + b"\xfd")[0] == -1
+    assert read_command(command + command)[0] == -1
 
 
 def test_a_flipped_bit_anywhere_is_left_to_the_codec() -> None:
     tick, command = tick_datagram(), command_datagram()
     for at in range(len(tick)):
-        assert read_tick(tick[:at] + bytes([tick[at] ^ 4]) + tick[at + 1 :], EMULATOR, new_reader()) is None
+        assert read_tick(tick[:at] + bytes([tick[at] ^ 4]) + tick[at + 1 :])[0] == -1
     for at in range(len(command)):
-        damaged = command[:at] + bytes([command[at] ^ 4]) + command[at + 1 :]
-        assert read_command(damaged, VEHICLE, new_reader(), SCALE, 5_000_000) is None
+        assert read_command(command[:at] + bytes([command[at] ^ 4]) + command[at + 1 :])[0] == -1
 
 
-def test_another_sender_another_time_or_another_number_is_left_to_the_codec() -> None:
-    assert read_tick(tick_datagram(), VEHICLE, new_reader()) is None
-    assert read_command(command_datagram(), EMULATOR, new_reader(), SCALE, 5_000_000) is None
-    assert read_command(command_datagram(), VEHICLE, new_reader(), SCALE, 6_000_000) is None
-    reader = new_reader()
-    reader.restart_sequences([(*EMULATOR, 9)])
-    assert read_tick(tick_datagram(sequence=3), EMULATOR, reader) is None
-    assert read_tick(tick_datagram(sequence=9), EMULATOR, reader) is not None
-    assert reader.counters["sequence_gaps"] == 0
+def test_another_sender_is_left_to_the_codec() -> None:
+    assert read_tick(tick_datagram())[0] == 5000
+    assert read_tick(tick_datagram(), VEHICLE)[0] == -1
+    assert read_command(command_datagram())[0] == 5000
+    assert read_command(command_datagram(), EMULATOR)[0] == -1
+
+
+def test_a_pose_and_a_tick_that_do_not_belong_together_are_left_to_the_codec() -> None:
+    first, second = tick_datagram(t_ns=5_000_000, sequence=3), tick_datagram(t_ns=6_000_000, sequence=3)
+    skipped = tick_datagram(t_ns=5_000_000, sequence=4)
+    pose_size = 12 + first[1]
+    assert read_tick(first[:pose_size] + second[pose_size:])[0] == -1
+    assert read_tick(first[:pose_size] + skipped[pose_size:])[0] == -1
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_bad_numbers_are_left_to_the_codec_which_counts_them(bad: float) -> None:
     writer = FrameWriter(*EMULATOR)
     q = np.array([bad, 0.0, 0.0, 0.0, 0.0, 0.0])
-    assert read_tick(b"".join(TickWriter(writer).frames(0, q, np.ones(13))), EMULATOR, new_reader()) is None
+    assert read_tick(b"".join(TickWriter(writer).frames(0, q, np.ones(13))))[0] == -1
     frame = CommandWriter(FrameWriter(*VEHICLE), SCALE, lockstep=True).frame(ActuatorCommand(0, q, armed=True))
-    assert read_command(frame, VEHICLE, new_reader(), SCALE, 0) is None
+    assert read_command(frame)[0] == -1
