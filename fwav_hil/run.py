@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,16 @@ _IN_TO_OUT = {"udpin": "udpout", "tcpin": "tcpout"}
 
 
 class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How the run is made. link: the emulator's URI; the controller gets its counterpart."""
+    """How the run is made. link: the emulator's URI; the controller gets its counterpart.
+
+    show_progress: False where the caller shows its own.
+    """
 
     clock: str = "lockstep"
     link: str = "udpin://127.0.0.1:14560"
     speed: float | None = None
     wait_s: float = 30.0
+    show_progress: bool = True
 
 
 class RunFailedError(FwavHilError):
@@ -119,7 +124,7 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
     # The controller learns its link when the emulator has opened its own: were the port another run's, it must not go there.
     controller = Child("controller", [*common, *placement.controller, "--link", "-", "--arm"])
     try:
-        _watch(scenario, emulator, controller, stop)
+        _watch(scenario, emulator, controller, stop, Progress(scenario.duration_s) if options.show_progress else None)
     finally:
         for child in (emulator, controller):
             child.end()
@@ -134,18 +139,18 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
     return summary
 
 
-def _watch(scenario: Scenario, emulator: Child, controller: Child, stop: StopFlag) -> None:
+def _watch(scenario: Scenario, emulator: Child, controller: Child, stop: StopFlag, progress: Progress | None) -> None:
     """Hear both processes until both have ended, and show how the run goes."""
     told = False
     patience = _PATIENCE
-    with Progress(scenario.duration_s) as progress:
+    with progress or nullcontext():
         for child, event in listen([emulator, controller]):
             kind = event.get("event")
             if child is emulator and kind == "waiting":
                 told = True
                 scheme, _, address = event["link"].partition("://")
                 controller.tell(f"{_IN_TO_OUT[scheme]}://{address}")
-            elif child is emulator and kind == "progress":
+            elif progress and child is emulator and kind == "progress":
                 progress.update(event["t_ns"] / NANOSECONDS, _error_now(scenario, event["t_ns"], event["q"]))
             if stop.requested or any(one.process.poll() for one in (emulator, controller)):
                 # What still runs ends by itself in a moment, or is asked to; signals of a terminal went to all already.

@@ -7,14 +7,20 @@ units, cm and rad, over the whole run, as in (34) and (35).
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
+from controller.laws import make_law
+from fwav_hil.report import FILES
+from fwav_hil.run import RunOptions, new_folder, run
 from fwav_hil.score import scores
 from fwav_hil.simulate import Simulation, simulate
+from plant_emulator.truth import load_truth
 from protocol.messages import AXES
 from protocol.scenario import Scenario
 
@@ -89,12 +95,53 @@ class Flight(NamedTuple):
     result: Simulation
 
 
-def fly_all(base: Scenario, progress: Callable[[str], None] = lambda _name: None) -> Iterator[Flight]:
-    """Fly every condition of a scenario; `progress` is told the name of each before it starts."""
-    for condition in conditions(base):
+def fly_all(
+    base: Scenario,
+    progress: Callable[[str], None] = lambda _name: None,
+    fly: Callable[[Scenario], Simulation] = simulate,
+    flown: Sequence[Condition] | None = None,
+) -> Iterator[Flight]:
+    """Fly the conditions of a scenario (every one, where not told which) by `fly`; conditions that are the same, once.
+
+    `progress` is told the name of each before it starts.
+    """
+    results: list[tuple[Scenario, Simulation]] = []
+    for condition in conditions(base) if flown is None else flown:
         progress(f"{base.name}: {condition.name}")
         scenario = condition.scenario(base)
-        yield Flight(condition, scenario, simulate(scenario))
+        result = next((result for known, result in results if known == scenario), None)
+        if result is None:
+            result = fly(scenario)
+            results.append((scenario, result))
+        yield Flight(condition, scenario, result)
+
+
+def conditions_on_the_wire(base: Scenario) -> list[Condition]:
+    """The conditions that a link can carry: all but state feedback."""
+    return [c for c in conditions(base) if not make_law(c.law, c.scenario(base)).needs_velocity]
+
+
+def fly_on_the_wire(scenario: Scenario) -> Simulation:
+    """Fly a scenario as two processes in lockstep; the recording is then thrown away. Raises what `run` raises."""
+    with tempfile.TemporaryDirectory(prefix="fwav-hil-") as temporary:
+        folder = new_folder(scenario, Path(temporary) / "run")
+        summary = run(scenario, folder, RunOptions(link="udpin://127.0.0.1:0", show_progress=False))
+        rows = load_truth(folder / FILES["ground_truth"])
+    columns = {name: np.array(rows[name]) for name in ("t_ns", "q", "q_dot", "command", "tau", "u")}
+    return Simulation(**columns, law_counts=summary["counters"]["controller"], divergence=None)
+
+
+def largest_difference(rows: Iterable[Row], others: Iterable[Row]) -> float:
+    """The largest difference of any cell, as a fraction of the larger one, among the cells that both have."""
+    known = {(row.scenario, row.table, row.condition, row.channel): row for row in others}
+    largest = 0.0
+    for row in rows:
+        other = known.get((row.scenario, row.table, row.condition, row.channel))
+        for measure in MEASURES if other else ():
+            one, two = getattr(row, measure), getattr(other, measure)
+            if one != two:
+                largest = max(largest, abs(one - two) / max(one, two))
+    return largest
 
 
 def paper_cells() -> dict[tuple[str, str, str], tuple[float, float]]:

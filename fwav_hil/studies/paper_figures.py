@@ -81,15 +81,18 @@ def draw_lyapunov(folder: Path, flight: Flight) -> Path:
     bound = lyapunov(flight.scenario, flight.result)
     figure = Figure(figsize=(13.0, 7.0), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(f"{flight.scenario.name}: V1 = q_z² / 2 and its bound (30), per axis")
+    figure.suptitle(f"{flight.scenario.name}: V1 = q_z² / 2, its bound (30), and that by comparison, per axis")
     t = flight.result.t_ns / NANOSECONDS
     for axis, panel in enumerate(figure.subplots(2, 3).flat):
         panel.semilogy(t, _positive(bound.bound[:, axis]), color=COLOURS[1], label="bound (30)")
+        panel.semilogy(t, _positive(bound.comparison[:, axis]), color=COLOURS[2], label="y' = -rho y + C1(t)")
         panel.semilogy(t, _positive(bound.v1[:, axis]), color=COLOURS[0], linewidth=0.7, label="V1")
         panel.set_title(AXES[axis])
         panel.grid(visible=True, alpha=0.3)
+        if axis >= 3:
+            panel.set_xlabel("time (s)")
         if axis == 0:
-            panel.legend()
+            panel.legend(loc="upper right")
     return _save(figure, folder / f"{flight.scenario.name}_lyapunov")
 
 

@@ -7,6 +7,9 @@ import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
+
+from fwav_hil.studies.lyapunov import Bound
 from fwav_hil.studies.paper import MEASURES, ORDERINGS, Claim, Row
 from protocol.messages import AXES
 
@@ -41,9 +44,9 @@ read how.
 
 
 def markdown_page(
-    rows: Sequence[Row], claims: Sequence[Claim], bounds: dict[str, list[float]], figures: Iterable[str]
+    rows: Sequence[Row], claims: Sequence[Claim], bounds: dict[str, dict[str, dict[str, float]]], figures: Iterable[str]
 ) -> str:
-    """The page: claims, tables, bound, figures. `bounds`: share of samples, by scenario and axis, at which (30) held."""
+    """The page: claims, tables, bounds, figures. `bounds`: share of samples at which each held, by scenario, bound and axis."""
     parts = [INTRODUCTION]
     for scenario in dict.fromkeys(row.scenario for row in rows):
         parts.append(f"## `{scenario}`\n")
@@ -52,11 +55,31 @@ def markdown_page(
             _table(title, [r for r in rows if (r.scenario, r.table) == (scenario, table)])
             for table, title in TITLES.items()
         ]
-        shares = ", ".join(f"{axis} {100.0 * share:.1f} %" for axis, share in zip(AXES, bounds[scenario], strict=True))
-        parts.append(f"The bound (30), with u~ from the run itself, held at: {shares} of the samples (law UDE).\n")
+        parts.append(
+            "Lyapunov quantities of the UDE run, u~ from the run itself: share of the samples at which V1 was within its "
+            f"bound. (30): {_shares(bounds[scenario]['bound'])}. By comparison with y' = -rho y + C1(t): "
+            f"{_shares(bounds[scenario]['comparison'])}. Sample by sample they are in `lyapunov_{scenario}.csv`, which the "
+            "command writes beside this page.\n"
+        )
     parts.append("## Figures\n")
     parts += [f"![{Path(figure).stem.replace('_', ' ')}]({figure})\n" for figure in figures]
     return "\n".join(parts)
+
+
+def _shares(held: dict[str, float]) -> str:
+    return ", ".join(f"{axis} {100.0 * share:.1f} %" for axis, share in held.items())
+
+
+def lyapunov_csv(t_ns: np.typing.NDArray[np.int64], bound: Bound) -> str:
+    """V1, its bound (30), the comparison's, and whether each held, per sample (a line each) and axis."""
+    columns = {"V1": bound.v1, "bound": bound.bound, "held": bound.held, "comparison": bound.comparison}
+    columns["comparison_held"] = bound.comparison_held
+    out = io.StringIO()
+    names = ",".join(f"{name}_{axis}" for name in columns for axis in AXES)
+    table = np.hstack([(t_ns * 1e-9)[:, None], *columns.values()])
+    formats = ["%.6f"] + ["%d" if "held" in name else "%.6g" for name in columns for _ in AXES]
+    np.savetxt(out, table, fmt=formats, delimiter=",", header=f"t,{names}", comments="")
+    return out.getvalue()
 
 
 def _claims_table(claims: Sequence[Claim]) -> str:
@@ -87,8 +110,8 @@ def _table(title: str, rows: Sequence[Row]) -> str:
 
 def _cell(printed: float | None, ours: float) -> str:
     if printed is None:
-        return f"{ours:.4f}"
-    return f"{printed:.4f} / {ours:.4f} ({ours / printed:.2g})"
+        return f"{ours:.4g}"
+    return f"{printed:.4f} / {ours:.4g} ({ours / printed:.2g})"
 
 
 def csv_text(rows: Sequence[Row]) -> str:

@@ -13,9 +13,23 @@ import pytest
 from bridge.command_line import run_command
 from controller.reference import reference_trajectory
 from fwav_hil.cli import cli
+from fwav_hil.simulate import Simulation, simulate
 from fwav_hil.studies.lyapunov import lyapunov
-from fwav_hil.studies.paper import Claim, Flight, Row, conditions, fly_all, judge, paper_cells, rows_of
+from fwav_hil.studies.paper import (
+    Claim,
+    Flight,
+    Row,
+    conditions,
+    conditions_on_the_wire,
+    fly_all,
+    fly_on_the_wire,
+    judge,
+    largest_difference,
+    paper_cells,
+    rows_of,
+)
 from protocol.messages import AXES
+from protocol.scenario import Scenario
 from tests.loop import scenario_of
 
 
@@ -101,13 +115,67 @@ def test_the_bound_of_a_motion_worked_out_by_hand() -> None:
     assert bound.bound[inner] == pytest.approx(np.broadcast_to(expected, bound.bound[inner].shape), rel=2e-2)
 
 
+def test_the_comparison_solves_its_equation_for_a_constant_and_is_closer_than_the_bound() -> None:
+    """q_e' = -Lambda q_e + c: q_z = c stays, u~ = K c, y -> (K c)^2 / 2 / rho from c^2 / 2."""
+    flight = flights("paper")[2]
+    gains = msgspec.structs.replace(flight.scenario.control, Lambda=(3.0,) * 6, K=(5.0,) * 6)
+    scenario = msgspec.structs.replace(flight.scenario, control=gains)
+    t = flight.result.t_ns * 1e-9
+    error = 0.01 * (1.0 - np.exp(-3.0 * t))[:, None] * np.ones(6)
+    rate = 0.03 * np.exp(-3.0 * t)[:, None] * np.ones(6)
+    desired = reference_trajectory(scenario.reference, len(t), scenario.period_ns)
+    bound = lyapunov(scenario, flight.result._replace(q=desired[:, 0] + error, q_dot=desired[:, 1] + rate))
+    start, level, rho = 0.5 * 0.03**2, 0.5 * (5.0 * 0.03) ** 2, 9.0
+    expected = level / rho + (start - level / rho) * np.exp(-rho * t)
+    assert bound.comparison == pytest.approx(np.broadcast_to(expected[:, None], error.shape), rel=1e-6)
+    assert bound.comparison_held.all()
+    assert (bound.comparison <= bound.bound * (1.0 + 1e-9)).all()
+
+
+def test_conditions_that_are_the_same_are_flown_once() -> None:
+    flown: list[Scenario] = []
+
+    def fly(scenario: Scenario) -> Simulation:
+        flown.append(scenario)
+        return simulate(scenario)
+
+    base = scenario_of("paper", duration_s=0.01)
+    assert len(list(fly_all(base, fly=fly))) == len(conditions(base))
+    assert len(flown) == len(conditions(base)) - 2  # the UDE stands in all three tables
+
+
+@pytest.mark.processes
+@pytest.mark.timeout(150)
+def test_the_tables_of_the_wire_agree_with_those_in_process() -> None:
+    base = scenario_of("paper", duration_s=0.5)
+    flown = conditions_on_the_wire(base)
+    assert [c.law for c in conditions(base) if c not in flown] == ["ude_state"]
+    some = [condition for condition in flown if condition.name in ("PD", "UDE")]
+    wire = [row for flight in fly_all(base, fly=fly_on_the_wire, flown=some) for row in rows_of(flight)]
+    here = [row for flight in fly_all(base) for row in rows_of(flight)]
+    assert len(wire) == 12
+    assert largest_difference(wire, here) < 1e-9
+
+
+def test_the_largest_difference_is_that_of_the_worst_cell_both_have() -> None:
+    rows = [Row("s", "II", name, "x", 2.0, 4.0, None, None) for name in ("PD", "UDE")]
+    others = [Row("s", "II", "PD", "x", 2.0, 5.0, None, None), Row("s", "II", "DOB", "x", 9.0, 9.0, None, None)]
+    assert largest_difference(rows, rows) == 0.0
+    assert largest_difference(rows, others) == pytest.approx(0.2)
+
+
 def test_the_command_writes_page_tables_and_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("fwav_hil.studies.paper_command.SCENARIOS", ("paper",))
+    monkeypatch.setattr("fwav_hil.studies.paper.fly_on_the_wire", simulate)
     out = tmp_path / "study"
-    assert run_command(cli, "fwav-hil", ["paper", "--out", str(out), "--json", str(tmp_path / "all.json")]) == 0
-    assert "UDE < PD" in capsys.readouterr().out
+    assert (
+        run_command(cli, "fwav-hil", ["paper", "--wire", "--out", str(out), "--json", str(tmp_path / "all.json")]) == 0
+    )
+    said = capsys.readouterr().out
+    assert "UDE < PD" in said
+    assert "largest difference of any cell 0 " in said
     result = json.loads((tmp_path / "all.json").read_text())
     assert set(result["rows"][0]) == set(Row.__struct_fields__)
     assert {"claim", "channel", "paper", "ours"} <= set(result["claims"][0])
