@@ -59,6 +59,11 @@ def unix_time_us() -> int:
     return time.time_ns() // 1000
 
 
+def unix_offset_ns() -> int:
+    """CLOCK_REALTIME less CLOCK_MONOTONIC now, ns: the kernel stamps what it receives with the former."""
+    return time.time_ns() - time.monotonic_ns()
+
+
 def local_stamp() -> str:
     """Date and time of day for the name of a folder, such as 2026-11-22T14-05-09."""
     return time.strftime("%Y-%m-%dT%H-%M-%S")

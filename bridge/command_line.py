@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import click
 
@@ -52,6 +53,32 @@ wait_option = click.option(
 json_option = click.option(
     "--json", "json_path", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
     help="Write the result as JSON to this file as well ('-': standard output; the table then goes to standard error).",
+)  # fmt: skip
+
+
+class DurationNs(click.ParamType[int]):
+    """A time with its unit, such as 5ms, 250us or 0.1s; gives whole nanoseconds."""
+
+    name = "time"
+    _UNITS: ClassVar[dict[str, float]] = {"ns": 1.0, "us": 1e3, "ms": 1e6, "s": 1e9}
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Nanoseconds of a text, or fail with the sentence that names the remedy."""
+        if isinstance(value, int):
+            return value
+        match = re.fullmatch(r"(\d+\.?\d*|\.\d+)(ns|us|ms|s)", value.strip())
+        if not match:
+            self.fail(f"{value!r} is no time: write a number and its unit, such as 5ms, 250us or 0.1s", param, ctx)
+        return round(float(match[1]) * self._UNITS[match[2]])
+
+
+delay_option = click.option(
+    "--delay", "delay_ns", type=DurationNs(), default=0, metavar="TIME",
+    help="Real time: let every command arrive later by so much wall time, such as 5ms.",
+)  # fmt: skip
+legs_option = click.option(
+    "--legs", is_flag=True,
+    help="Real time: note when each sample and command was where, in the run folder; see `fwav-hil latency`.",
 )  # fmt: skip
 
 process_options = options(

@@ -70,6 +70,9 @@ class Link(abc.ABC):
     spin_s: float = 0.0
     """Poll for this long before sleeping in `recv`: a core kept busy for a quicker hand-over. UDP only; others ignore it."""
 
+    received_ns: int = 0
+    """When the kernel received what `recv` returned last, on `MonotonicClock`; 0 where that is not known."""
+
     def __init__(self, uri: str) -> None:
         """Set up what every link has; `uri` is how messages name the link."""
         self.uri = uri
@@ -104,6 +107,10 @@ class Link(abc.ABC):
     @abc.abstractmethod
     def peer(self) -> str:
         """A name for the other end, for messages: "127.0.0.1:43210", or NOBODY."""
+
+    def stamp_receives(self) -> bool:
+        """Have `received_ns` told from now on; False where the transport or the system cannot."""
+        return False
 
     def release_peer(self) -> None:  # noqa: B027  (most links have nothing to release)
         """Forget the peer, so that another may take its place; does nothing where the peer is fixed."""

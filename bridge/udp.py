@@ -20,10 +20,11 @@ import abc
 import select
 import socket
 import struct
+import sys
 from typing import Final
 
 from bridge.addresses import Address, cannot_bind, name_of, new_socket, resolve
-from bridge.clock import MonotonicClock
+from bridge.clock import MonotonicClock, unix_offset_ns
 from bridge.link import NOBODY, SHORTEST_WAIT_S, Link, LinkUri, join_address
 from protocol.errors import LinkClosedError, LinkError
 
@@ -32,6 +33,9 @@ WANTED_BUFFER_BYTES: Final = 1 << 20
 
 _BLOCKING_WAIT_S = 0.008
 _ONE_JIFFY = struct.pack("@ll", 0, 1000)  # struct timeval of 1 ms; the kernel rounds up to a jiffy
+_SO_TIMESTAMPNS = 35  # as option and as type of the control message; not among Python's names
+_TIMESPEC = struct.Struct("@ll")
+_STAMP_SPACE = socket.CMSG_SPACE(_TIMESPEC.size)
 _DROPS_PER_RECV = 1000  # strangers' datagrams that one recv clears away once its time is up; the next goes on
 
 
@@ -45,8 +49,26 @@ class _UdpLink(Link):
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _ONE_JIFFY)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WANTED_BUFFER_BYTES)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WANTED_BUFFER_BYTES)
+        self._is_stamped = False
         self.receive_buffer_bytes = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         """What the system granted of WANTED_BUFFER_BYTES; Linux reports twice what it counts as payload."""
+
+    def stamp_receives(self) -> bool:
+        """Ask for SO_TIMESTAMPNS (Linux). See `Link.stamp_receives`."""
+        if sys.platform == "linux":
+            self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            self._is_stamped = True
+        return self._is_stamped
+
+    def _receive_stamped(self, flags: int) -> tuple[bytes, Address]:
+        """A datagram and its sender, the kernel's stamp of it noted."""
+        data, ancillary, _, sender = self._socket.recvmsg(LARGEST_DATAGRAM_BYTES, _STAMP_SPACE, flags)
+        self.received_ns = 0
+        for level, kind, value in ancillary:
+            if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS:
+                seconds, nanoseconds = _TIMESPEC.unpack(value)
+                self.received_ns = seconds * 1_000_000_000 + nanoseconds - unix_offset_ns()
+        return data, sender
 
     @abc.abstractmethod
     def _take(self, flags: int) -> bytes | None:
@@ -137,7 +159,10 @@ class UdpIn(_UdpLink):
         self.uri = f"{uri.scheme}://{join_address(uri.host, self.port)}"
 
     def _take(self, flags: int) -> bytes | None:
-        data, sender = self._socket.recvfrom(LARGEST_DATAGRAM_BYTES, flags)
+        if self._is_stamped:
+            data, sender = self._receive_stamped(flags)
+        else:
+            data, sender = self._socket.recvfrom(LARGEST_DATAGRAM_BYTES, flags)
         if sender != self._peer:
             if self._peer is not None:
                 self.stats.unknown_peer += 1
@@ -189,6 +214,8 @@ class UdpOut(_UdpLink):
 
     def _take(self, flags: int) -> bytes | None:
         try:
+            if self._is_stamped:
+                return self._receive_stamped(flags)[0]
             return self._socket.recv(LARGEST_DATAGRAM_BYTES, flags)
         except ConnectionRefusedError:
             self.stats.refused += 1

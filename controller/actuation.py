@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bridge.clock import Clock
 from bridge.endpoint import Endpoint
 from controller.vehicle import Vehicle
 from protocol import mavlink_map
@@ -13,15 +14,21 @@ from protocol.tick_frames import CommandWriter
 class HilActuation:
     """Publishes commands, and the reference for the log; keeps the last answer, to give it again.
 
+    sent_ns    when the last answer was handed to the link, on the clock
+
     counters   repeated  answers given again, because their tick came again or the next one is missing
     """
 
-    def __init__(self, endpoint: Endpoint, vehicle: Vehicle, scale: FloatArray, *, lockstep: bool) -> None:
+    def __init__(
+        self, endpoint: Endpoint, vehicle: Vehicle, scale: FloatArray, clock: Clock, *, lockstep: bool
+    ) -> None:
         self._endpoint = endpoint
         self._vehicle = vehicle
         self.commands = CommandWriter(endpoint.writer, scale, lockstep=lockstep)
         self._reference = Due(stream("POSITION_TARGET_LOCAL_NED").rate_hz or 1.0)
+        self._clock = clock
         self._last = b""
+        self.sent_ns = 0
         self.answered_ns = -1
         self.counters = {"repeated": 0}
 
@@ -41,6 +48,7 @@ class HilActuation:
         """Send the whole answer to the sample of t_ns, and keep it."""
         self._last = answer
         self.answered_ns = t_ns
+        self.sent_ns = self._clock.now_ns()
         self._endpoint.link.send(answer)
 
     @property

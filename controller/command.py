@@ -13,6 +13,7 @@ from bridge.command_line import (
     clock_option,
     json_option,
     law_option,
+    legs_option,
     options,
     process_options,
     rate_option,
@@ -42,6 +43,7 @@ Example:
         "--arm/--no-arm", default=True, show_default=True,
         help="Arm as soon as the emulator shows the same scenario, or wait for MAV_CMD_COMPONENT_ARM_DISARM.",
     ),
+    legs_option,
     wait_option,
     click.option(
         "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Folder for the counters.",
@@ -56,6 +58,7 @@ def controller(
     clock: str,
     rate: float | None,
     arm: bool,
+    legs: bool,
     wait_s: float,
     out: Path | None,
     json_path: Path | None,
@@ -69,6 +72,8 @@ def controller(
     report, stop = begin_process(status, core, with_parent=with_parent)
     from controller.process import ControllerOptions, run_controller
 
-    run_options = ControllerOptions(link=link, clock=clock, arm=arm, out=out, wait_s=wait_s, spin_s=spin_us * 1e-6)
+    run_options = ControllerOptions(
+        link=link, clock=clock, arm=arm, out=out, wait_s=wait_s, spin_s=spin_us * 1e-6, legs=legs
+    )
     summary = run_controller(chosen, run_options, report, stop)
     show_json(json_path, {"scenario": chosen.name, "rate_hz": chosen.rate_hz, **summary})

@@ -12,10 +12,12 @@ import numpy as np
 
 from bridge.clock import Clock, MonotonicClock
 from bridge.endpoint import VEHICLE, Endpoint
+from bridge.legs import CONTROLLER_FILE, SAMPLE_COLUMNS, LegTable, save_legs
 from bridge.link import Link
 from bridge.memory import memory_pair
 from bridge.process import Report, StopFlag, open_patiently
 from bridge.summary import make_folder, write_json
+from bridge.timesync import TimeSync
 from controller.actuation import HilActuation
 from controller.law import Law
 from controller.laws import make_law
@@ -36,7 +38,11 @@ PATIENCE_PERIODS = 1.5
 
 
 class ControllerOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How the process runs. link: a URI, or `-` to read it from standard input once everything is ready."""
+    """How the process runs.
+
+    link: a URI, or `-` to read it from standard input once everything is ready. legs: real time: note when each sample
+    and command was where.
+    """
 
     link: str
     clock: str = "lockstep"
@@ -44,6 +50,7 @@ class ControllerOptions(msgspec.Struct, frozen=True, kw_only=True):
     out: Path | None = None
     wait_s: float = 30.0
     spin_s: float = 0.0
+    legs: bool = False
 
 
 class Controller:
@@ -68,7 +75,7 @@ class Controller:
         self.vehicle = Vehicle(self.endpoint, scenario.digest(), component, arm=options.arm)
         self.telemetry = HilTelemetry(component)
         lockstep = options.clock == "lockstep"
-        self.actuation = HilActuation(self.endpoint, self.vehicle, law.output.scale, lockstep=lockstep)
+        self.actuation = HilActuation(self.endpoint, self.vehicle, law.output.scale, clock, lockstep=lockstep)
         self._quick = QuickAnswers(
             law, self.state, self.endpoint, self.actuation.commands, component, lockstep=lockstep
         )
@@ -78,6 +85,9 @@ class Controller:
         self._samples: deque[PositionSample] = deque()
         self._silence_ns = 0
         self._begun = self._was_armed = False
+        self.time_sync = TimeSync(self.endpoint, clock)
+        self.legs = LegTable(SAMPLE_COLUMNS) if options.legs else None
+        self._woke_ns = 0
         self.counters = {"late_samples": 0}
 
     def run(self) -> None:
@@ -92,7 +102,9 @@ class Controller:
                 self.law.restart(self.state)  # what a disarmed law remembers never acted
             self._was_armed = armed
             tau = self.law.step(self.state, sample.t_ns, sample.q)
+            computed_ns = self.clock.now_ns()
             self.actuation.publish(ActuatorCommand(sample.t_ns, tau, armed), self.state.desired)
+            self._note(sample.t_ns, computed_ns)
             self._get_ready()
 
     def _meet(self) -> None:
@@ -121,6 +133,8 @@ class Controller:
         while not self._samples and not self.vehicle.ended:
             self.stop.check()
             begun_ns = self.clock.now_ns()
+            if not self._lockstep and self._begun and begun_ns >= self.time_sync.next_ns:
+                self.endpoint.send([self.time_sync.question()])
             # Once a sample is late, the command that stands is given again each period.
             if self._look(self._period_s if self._silence_ns else self._patience_s):
                 self._silence_ns = 0
@@ -149,6 +163,8 @@ class Controller:
             ) from None
         if not data:
             return False
+        if not self._lockstep:
+            self._woke_ns = self.clock.now_ns()
         if self._answer_at_once(data):
             return True
         for frame in self.endpoint.reader.read(data):
@@ -159,6 +175,10 @@ class Controller:
                         self._begun = True
                         self.endpoint.reader.restart_sequences([(frame.system, frame.component, frame.sequence + 1)])
                     self._samples.append(sample)
+            elif frame.message_id == mavlink_map.TIMESYNC.message_id and not self._lockstep:
+                answer = self.time_sync.take(frame, self._woke_ns)
+                if answer:
+                    self.endpoint.send([answer])
             else:
                 self.vehicle.take(frame)
         self._get_ready()
@@ -169,10 +189,17 @@ class Controller:
         t_ns, answer = self._quick.to(data)
         if t_ns < 0:
             return False
+        computed_ns = self.clock.now_ns() if self.legs else 0
         self.actuation.send(t_ns, answer)
+        self._note(t_ns, computed_ns)
         self.telemetry.taken(t_ns)
         self._get_ready()
         return True
+
+    def _note(self, t_ns: int, computed_ns: int) -> None:
+        """Note when the sample of t_ns and its command, just sent, were where."""
+        if self.legs:
+            self.legs.add(t_ns, self.endpoint.link.received_ns, self._woke_ns, computed_ns, self.actuation.sent_ns)
 
     def _get_ready(self) -> None:
         """Say which samples may be answered at once: those after the last one, while armed and nothing else is due."""
@@ -215,11 +242,15 @@ def run_controller(scenario: Scenario, options: ControllerOptions, report: Repor
     law = make_law(scenario.law, scenario)
     if law.needs_velocity:
         raise UsageError(law.velocity_sentence())
+    if options.legs and (options.clock != "realtime" or not options.out):
+        raise UsageError("--legs notes times of a real-time run in a folder: add --clock realtime and --out DIR")
     warm_up(law)
     uri = _told_link() if options.link == "-" else options.link
     report({"event": "waiting", "link": uri})
     with open_patiently(uri, options.wait_s, stop) as link:
         link.spin_s = options.spin_s
+        if options.legs:
+            link.stamp_receives()
         return serve(scenario, law, link, options, report, stop)
 
 
@@ -248,6 +279,8 @@ def serve(
     if options.out:
         make_folder(options.out)
         write_json(options.out / "controller.json", summary)
+        if controller.legs:
+            save_legs(options.out / CONTROLLER_FILE, {"samples": controller.legs}, controller.time_sync.estimate)
     report({"event": "ended", **summary})
     if error:
         raise error

@@ -15,9 +15,11 @@ from bridge.command_line import (
     DEFAULT_PORT,
     chosen_scenario,
     clock_option,
+    delay_option,
     duration_option,
     json_option,
     law_option,
+    legs_option,
     options,
     rate_option,
     scenario_argument,
@@ -33,6 +35,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "simulate": ("fwav_hil.cli:simulate_command", "Fly a scenario in this process, without a link."),
         "emulator": ("plant_emulator.command:emulator", "Run the plant emulator alone."),
         "controller": ("controller.command:controller", "Run the controller alone."),
+        "latency": ("fwav_hil.latency.command:latency", "Measure where the time goes in the loop or on a link."),
         "paper": ("fwav_hil.studies.paper_command:paper_command", "Run the source paper's section IV again."),
         "report": ("fwav_hil.cli:report_command", "Score and plot a run folder again."),
     }
@@ -102,6 +105,8 @@ plots_option = click.option("--plots/--no-plots", default=True, show_default=Tru
         "--link", default=f"udpin://127.0.0.1:{DEFAULT_PORT}", show_default=True, metavar="URI",
         help="The emulator's end of the link: udpin:// or tcpin://; port 0 takes a free one.",
     ),
+    delay_option,
+    legs_option,
     wait_option,
     out_option,
     plots_option,
@@ -116,6 +121,8 @@ def run_command(
     duration: float | None,
     seed: int | None,
     link: str,
+    delay_ns: int,
+    legs: bool,
     wait_s: float,
     out: Path | None,
     plots: bool,
@@ -132,10 +139,18 @@ def run_command(
     if chosen_law.needs_velocity:
         raise UsageError(chosen_law.velocity_sentence())
     check_link(link)
+    if clock != "realtime" and (delay_ns or legs):
+        raise UsageError(
+            "--delay and --legs are of real time: add --clock realtime (in lockstep the scenario's [delay] is)"
+        )
     compile_kernels(chosen)
     folder = new_folder(chosen, out)
     try:
-        run(chosen, folder, RunOptions(clock=clock, link=link, speed=speed, wait_s=wait_s))
+        run(
+            chosen,
+            folder,
+            RunOptions(clock=clock, link=link, speed=speed, wait_s=wait_s, delay_ns=delay_ns, legs=legs),
+        )
     except FwavHilError:
         # The run's own error is the one to end with, whatever else its folder gives trouble with.
         with contextlib.suppress(FwavHilError):

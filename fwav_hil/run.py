@@ -26,7 +26,7 @@ _IN_TO_OUT = {"udpin": "udpout", "tcpin": "tcpout"}
 class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     """How the run is made. link: the emulator's URI; the controller gets its counterpart.
 
-    show_progress: False where the caller shows its own.
+    show_progress: False where the caller shows its own. delay_ns, legs: see `EmulatorOptions`.
     """
 
     clock: str = "lockstep"
@@ -34,6 +34,8 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     speed: float | None = None
     wait_s: float = 30.0
     show_progress: bool = True
+    delay_ns: int = 0
+    legs: bool = False
 
 
 class RunFailedError(FwavHilError):
@@ -119,8 +121,12 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
         "--wait",
         str(options.wait_s),
     ]
-    speed = ["--speed", str(options.speed)] if options.speed else []
-    emulator = Child("plant_emulator", [*common, *placement.emulator, "--link", f"{scheme}://{address}", *speed])
+    own = ["--speed", str(options.speed)] if options.speed else []
+    if options.delay_ns:
+        own += ["--delay", f"{options.delay_ns}ns"]
+    if options.legs:
+        common.append("--legs")
+    emulator = Child("plant_emulator", [*common, *placement.emulator, "--link", f"{scheme}://{address}", *own])
     # The controller learns its link when the emulator has opened its own: were the port another run's, it must not go there.
     controller = Child("controller", [*common, *placement.controller, "--link", "-", "--arm"])
     try:

@@ -35,16 +35,21 @@ def _loop(
     packed_law_state: Packed,
     packed_plant: Packed,
     parameters: Packed,
-    delay_ns: int,
+    delays_ns: np.typing.NDArray[np.int64],
     normal: FloatArray,
     position_noise: float,
     attitude_noise: float,
     rows: FloatArray,
 ) -> tuple[int, int]:
-    """Run len(rows) ticks; row k is q, q', command, tau, u (30 numbers) at t_k. Returns (rows made, outcome)."""
+    """Run len(rows) ticks; row k is q, q', command, tau, u (30 numbers) at t_k. Returns (rows made, outcome).
+
+    The command of tick k acts delays_ns[k] later, but never before the one of the tick before; where that is negative it
+    never does.
+    """
     law, law_state, plant, body = packed_law[0], packed_law_state[0], packed_plant[0], parameters[0]
     period_ns = law.period_ns
     measured, seen, wire, allowed = np.empty(6), np.empty(6), np.empty(7), np.empty(6)
+    acts_ns = 0
     for k in range(rows.shape[0]):
         t_ns = k * period_ns
         add_noise(plant.motion, normal[k], position_noise, attitude_noise, measured)
@@ -52,8 +57,10 @@ def _loop(
         pose_from_wire(wire, seen)
         control_step(law, law, law, period_ns, law_state, t_ns, seen, plant.motion[6:])
         clamp(law_state.tau, law.lower, law.upper, allowed)
-        if not push_command(plant, t_ns + delay_ns, allowed):
-            return k, TOO_MANY_PENDING
+        if delays_ns[k] >= 0:
+            acts_ns = max(acts_ns, t_ns + delays_ns[k])
+            if not push_command(plant, acts_ns, allowed):
+                return k, TOO_MANY_PENDING
         apply_due_commands(plant, body, t_ns)
         row = rows[k]
         row[:12] = plant.motion
@@ -83,8 +90,13 @@ class Simulation(NamedTuple):
     divergence: str | None
 
 
-def simulate(scenario: Scenario, law: Law | None = None) -> Simulation:
-    """Run a scenario; `law` replaces the scenario's own. A divergence ends the run early and is named in the result."""
+def simulate(
+    scenario: Scenario, law: Law | None = None, delays_ns: np.typing.NDArray[np.int64] | None = None
+) -> Simulation:
+    """Run a scenario; `law` replaces the scenario's own. A divergence ends the run early and is named in the result.
+
+    delays_ns (ticks,): the delay of each tick's command in place of the scenario's; one below 0 never acts.
+    """
     law = law or make_law(scenario.law, scenario)
     plant = Plant(scenario)
     state = law.start()
@@ -95,7 +107,7 @@ def simulate(scenario: Scenario, law: Law | None = None) -> Simulation:
         state.packed,
         plant.state.packed,
         plant.parameters,
-        scenario.delay_ns,
+        np.full(scenario.ticks, scenario.delay_ns, dtype=np.int64) if delays_ns is None else delays_ns,
         normal,
         scenario.noise.position,
         scenario.noise.attitude,

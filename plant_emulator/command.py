@@ -11,8 +11,10 @@ from bridge.command_line import (
     begin_process,
     chosen_scenario,
     clock_option,
+    delay_option,
     duration_option,
     json_option,
+    legs_option,
     options,
     process_options,
     rate_option,
@@ -44,6 +46,8 @@ Example:
     rate_option,
     duration_option,
     seed_option,
+    delay_option,
+    legs_option,
     wait_option,
     click.option(
         "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
@@ -60,6 +64,8 @@ def emulator(
     rate: float | None,
     duration: float | None,
     seed: int | None,
+    delay_ns: int,
+    legs: bool,
     wait_s: float,
     out: Path | None,
     json_path: Path | None,
@@ -73,6 +79,8 @@ def emulator(
     report, stop = begin_process(status, core, with_parent=with_parent)
     from plant_emulator.process import EmulatorOptions, run_emulator
 
-    run_options = EmulatorOptions(link=link, clock=clock, speed=speed, out=out, wait_s=wait_s, spin_s=spin_us * 1e-6)
+    run_options = EmulatorOptions(
+        link=link, clock=clock, speed=speed, out=out, wait_s=wait_s, spin_s=spin_us * 1e-6, delay_ns=delay_ns, legs=legs
+    )
     summary = run_emulator(chosen, run_options, report, stop)
     show_json(json_path, {"scenario": chosen.name, "rate_hz": chosen.rate_hz, "seed": chosen.seed, **summary})

@@ -10,8 +10,10 @@ from collections.abc import Sequence
 
 from bridge.clock import Clock, unix_time_us
 from bridge.endpoint import VEHICLE, Endpoint
+from bridge.legs import LegTable
 from bridge.process import StopFlag
 from bridge.rate import RateKeeper
+from bridge.timesync import TimeSync
 from plant_emulator.emulator import Emulator
 from protocol import mavlink_map
 from protocol.errors import DivergenceError, PeerLostError
@@ -219,6 +221,8 @@ class RealTime(Pacing):
                old_commands     commands older than one that came before, dropped
                repeated         commands that came again: they stand, and do not count as fresh
                unknown_echoes   commands that answer no tick that was sent, dropped
+
+    legs   where to note when each tick and command was where, or None; time_sync: the other end's clock, asked for if so
     """
 
     def __init__(
@@ -235,7 +239,9 @@ class RealTime(Pacing):
         self._sent: dict[int, int] = {}
         self._newest_ns = -1
         self._begun = False
-        self._heard_ns = clock.now_ns()
+        self.time_sync = TimeSync(endpoint, clock)
+        self.legs: tuple[LegTable, LegTable] | None = None
+        self._heard_ns = self._due_ns = clock.now_ns()
         self.counters = {
             **self._keeper.counters,
             "unanswered": 0,
@@ -249,14 +255,19 @@ class RealTime(Pacing):
         self.stop.check()
         if tick == 0:
             self._keeper.start()
-            self._heard_ns = self.clock.now_ns()
+            self._heard_ns = self._due_ns = self.clock.now_ns()
+        woke_ns = self.clock.now_ns()
         frames = self.emulator.sense(t_ns)
         begun_ns = self.clock.now_ns()
         self.endpoint.send(frames)
         self.owe_log(unix_time_us(), frames)
         self.settle_log()
         self._sent[t_ns] = begun_ns
-        deadline_ns = self._keeper.deadline_ns
+        if self.legs:
+            self.legs[0].add(t_ns, self._due_ns, woke_ns, begun_ns)
+        if begun_ns >= self.time_sync.next_ns:
+            self._say(self.time_sync.question())
+        self._due_ns = deadline_ns = self._keeper.deadline_ns
         while (remaining_ns := deadline_ns - self.clock.now_ns()) > 0:
             received = self.endpoint.receive(remaining_ns * 1e-9)
             arrived_ns = self.clock.now_ns()
@@ -280,6 +291,11 @@ class RealTime(Pacing):
         if (frame.system, frame.component) != VEHICLE:
             return
         self._heard_ns = wall_ns
+        if frame.message_id == mavlink_map.TIMESYNC.message_id:
+            answer = self.time_sync.take(frame, wall_ns)
+            if answer:
+                self._say(answer)
+            return
         if frame.message_id != mavlink_map.COMMAND.message_id:
             return
         if not self._begun:
@@ -302,3 +318,10 @@ class RealTime(Pacing):
         self.latencies_ns.append(wall_ns - sent_ns)
         self._sent = {t_ns: sent for t_ns, sent in self._sent.items() if t_ns > command.t_ns}
         self.emulator.act(arrival_ns, 0, command)
+        if self.legs:
+            applied_ns = self.clock.now_ns()
+            self.legs[1].add(command.t_ns, self.endpoint.link.received_ns, wall_ns, applied_ns, arrival_ns)
+
+    def _say(self, frame: bytes) -> None:
+        self.endpoint.send([frame])
+        self.owe_log(unix_time_us(), [frame])

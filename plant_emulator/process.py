@@ -10,6 +10,8 @@ import numpy as np
 
 from bridge.clock import Clock, MonotonicClock
 from bridge.endpoint import VEHICLE, Endpoint, refuse_other_scenario
+from bridge.faults import DelayedLink
+from bridge.legs import ANSWER_COLUMNS, EMULATOR_FILE, TICK_COLUMNS, LegTable, save_legs
 from bridge.link import Link
 from bridge.memory import memory_pair
 from bridge.process import Report, StopFlag, open_patiently
@@ -19,7 +21,7 @@ from plant_emulator.emulator import Emulator
 from plant_emulator.pacing import Lockstep, Pacing, RealTime
 from plant_emulator.truth import TruthWriter
 from protocol import mavlink_map
-from protocol.errors import FwavHilError, PeerMissingError, RunFolderError
+from protocol.errors import FwavHilError, PeerMissingError, RunFolderError, UsageError
 from protocol.messages import ActuatorCommand
 from protocol.scenario import NANOSECONDS, Scenario
 from protocol.streams import Due
@@ -35,6 +37,7 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     """How the process runs.
 
     speed: lockstep paced to that multiple of real time (None: as fast as it goes). spin_s: see `Link.spin_s`.
+    delay_ns: real time: what comes is taken so much later. legs: real time: note when each tick and command was where.
     """
 
     link: str
@@ -43,14 +46,25 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     out: Path | None = None
     wait_s: float = 30.0
     spin_s: float = 0.0
+    delay_ns: int = 0
+    legs: bool = False
 
 
 def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
     """Open the link and `fly`. Raises the errors of `protocol.errors`."""
+    if options.clock != "realtime" and (options.delay_ns or options.legs):
+        raise UsageError(
+            "--delay and --legs are of real time: add --clock realtime (in lockstep the delay is the scenario's, [delay])"
+        )
+    if options.legs and not options.out:
+        raise UsageError("--legs needs a folder for the time stamps: add --out DIR")
     warm_up(scenario)
     with open_patiently(options.link, options.wait_s, stop) as link:
         link.spin_s = options.spin_s
-        return fly(scenario, link, options, report, stop)
+        if options.legs:
+            link.stamp_receives()
+        delayed = DelayedLink(link, options.delay_ns, MonotonicClock()) if options.delay_ns else link
+        return fly(scenario, delayed, options, report, stop)
 
 
 def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
@@ -72,6 +86,8 @@ def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report
         report({"event": "waiting", "link": link.uri})
         _meet_controller(scenario, options, endpoint, stop)
         report({"event": "started", "peer": link.peer})
+        if options.legs and isinstance(pacing, RealTime):
+            pacing.legs = LegTable(TICK_COLUMNS), LegTable(ANSWER_COLUMNS)
         return _run_ticks(scenario, emulator, pacing, options.out, report)
     finally:
         _close_files(log, truth)
@@ -187,6 +203,9 @@ def _run_ticks(
     }
     if out:
         write_json(out / "emulator.json", summary)
+        if isinstance(pacing, RealTime) and pacing.legs:
+            ticks, answers = pacing.legs
+            save_legs(out / EMULATOR_FILE, {"ticks": ticks, "answers": answers}, pacing.time_sync.estimate)
     report({"event": "ended", **summary})
     if error:
         raise error

@@ -29,6 +29,7 @@ POSITION_TARGET = layout("POSITION_TARGET_LOCAL_NED")
 ATTITUDE_TARGET = layout("ATTITUDE_TARGET")
 COMMAND_LONG = layout("COMMAND_LONG")
 COMMAND_ACK = layout("COMMAND_ACK")
+TIMESYNC = layout("TIMESYNC")
 
 UNIT_TOLERANCE = 1e-3
 """How far the length of a quaternion may be from one."""
@@ -352,6 +353,17 @@ def encode_acknowledgement(command: int, *, accepted: bool) -> bytes:
     """COMMAND_ACK payload: accepted; else denied, or unsupported where it was no arming command."""
     refused = common.MAV_RESULT_DENIED if command == ARM_DISARM else common.MAV_RESULT_UNSUPPORTED
     return COMMAND_ACK.pack_fields(command=command, result=common.MAV_RESULT_ACCEPTED if accepted else refused)
+
+
+def encode_timesync(answer_ns: int, asked_ns: int) -> bytes:
+    """TIMESYNC payload: tc1 (0 in a question) and ts1, both ns of the clock of who fills them in."""
+    return TIMESYNC.pack_fields(tc1=answer_ns, ts1=asked_ns)
+
+
+def decode_timesync(payload: bytes) -> tuple[int, int]:
+    """(tc1, ts1) of a TIMESYNC, ns."""
+    values = TIMESYNC.unpack_fields(payload)
+    return int(values["tc1"]), int(values["ts1"])
 
 
 ARM_DISARM = common.MAV_CMD_COMPONENT_ARM_DISARM

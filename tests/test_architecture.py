@@ -24,4 +24,7 @@ def test_only_the_clock_asks_for_the_time(source: Path) -> None:
 @pytest.mark.parametrize("source", SOURCES, ids=lambda source: str(source.relative_to(ROOT)))
 def test_no_file_shadows_a_module_and_none_uses_mavutil(source: Path) -> None:
     assert source.stem not in SHADOWED
-    assert "mavutil" not in re.sub(r'""".*?"""', "", source.read_text(encoding="utf-8"), flags=re.DOTALL)
+    text = source.read_text(encoding="utf-8")
+    is_measured_beside_ours = source.name == "mavutil_peer.py"  # a process of its own, which no module imports
+    assert is_measured_beside_ours or not re.search(r"import.*\bmavutil\b", text)
+    assert not re.search(r"import.*\bmavutil_peer\b", text)

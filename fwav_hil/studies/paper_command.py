@@ -24,7 +24,7 @@ SCENARIOS = ("paper", "paper_disturbed")
 
 @click.command(
     "paper",
-    epilog="\b\nExamples:\n  fwav-hil paper --out /tmp/paper --json /tmp/paper.json\n  fwav-hil paper --wire --out /tmp/wire",
+    epilog="\b\nExample:\n  fwav-hil paper --out /tmp/paper --json /tmp/paper.json\n  fwav-hil paper --wire --out /tmp/wire",
 )
 @options(
     click.option(

@@ -1,0 +1,79 @@
+"""Faults put into a link on purpose. A fault is injected; an error is ours."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from bridge.clock import Clock
+from bridge.link import Link
+from protocol.errors import LinkClosedError
+
+_SPIN_NS = 200_000
+"""The last of a wait is polled through: a sleep would end up to this much late, which would be a delay of its own."""
+
+
+class DelayedLink(Link):
+    """A link whose receiving end gets everything later by a fixed wall time, in the order in which it came.
+
+    The delay counts from the kernel's receive time where the link tells it, else from when the datagram was fetched.
+    """
+
+    def __init__(self, link: Link, delay_ns: int, clock: Clock) -> None:
+        super().__init__(link.uri)
+        self.is_datagram = link.is_datagram
+        self.stats = link.stats
+        self._link = link
+        self._clock = clock
+        self._delay_ns = delay_ns
+        self._held: deque[tuple[int, int, bytes]] = deque()
+        self._ended_by: LinkClosedError | None = None
+
+    def recv(self, timeout_s: float) -> bytes | None:
+        """What the link delivered a delay ago, or None; see `Link.recv`."""
+        give_up_ns = self._clock.now_ns() + round(max(0.0, timeout_s) * 1e9)
+        while True:
+            now_ns = self._clock.now_ns()
+            if self._held and self._held[0][0] <= now_ns:
+                _, self.received_ns, data = self._held.popleft()
+                return data
+            if self._ended_by and not self._held:
+                raise self._ended_by
+            until_ns = min(give_up_ns, self._held[0][0]) if self._held else give_up_ns
+            if self._ended_by:
+                self._clock.sleep_until_ns(until_ns)  # what it delivered before it closed is still on its way
+                continue
+            self._fetch(max(0, until_ns - now_ns - _SPIN_NS) * 1e-9)
+            if now_ns >= give_up_ns:
+                return None
+
+    def _fetch(self, timeout_s: float) -> None:
+        """Take in what has come to the link."""
+        try:
+            data = self._link.recv(timeout_s)
+        except LinkClosedError as error:
+            self._ended_by = error
+            return
+        if data:
+            came_ns = self._link.received_ns or self._clock.now_ns()
+            self._held.append((came_ns + self._delay_ns, self._link.received_ns, data))
+
+    def send(self, data: bytes | bytearray | memoryview) -> None:
+        """Send at once."""
+        self._link.send(data)
+
+    def stamp_receives(self) -> bool:
+        """As the link does; a stamp is that of the arrival, before the delay."""
+        return self._link.stamp_receives()
+
+    def close(self) -> None:
+        """Close the link; what is on its way is lost."""
+        self._link.close()
+
+    @property
+    def peer(self) -> str:
+        """The link's."""
+        return self._link.peer
+
+    def release_peer(self) -> None:
+        """As the link does."""
+        self._link.release_peer()

@@ -1,0 +1,77 @@
+"""TIMESYNC: how far the other end's clock is ahead of ours, and how sure that is.
+
+A question carries our time (ts1) and tc1 = 0; the answer gives ts1 back beside the answerer's time (tc1). The offset is
+tc1 - (ts1 + arrival) / 2, wrong by half the round trip at most; of the newest answers the one with the shortest round trip
+is believed. Source: the MAVLink time synchronisation service (v2), of which the released dialect has the fields tc1 and ts1
+only: whose question an answer belongs to is told by its ts1.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+from bridge.clock import Clock
+from bridge.endpoint import Endpoint
+from protocol import mavlink_map
+from protocol.mavlink_codec import Frame
+
+BURST = 10
+BURST_PERIOD_NS = 50_000_000
+PERIOD_NS = 1_000_000_000
+_REMEMBERED = 16
+"""Answers among which the best is chosen, and questions whose answers are still awaited."""
+
+
+class Estimate(NamedTuple):
+    """offset_ns: the other clock less ours; round_trip_ns: twice the bound of its error; answers: how many came."""
+
+    offset_ns: int
+    round_trip_ns: int
+    answers: int
+
+    @property
+    def error_ns(self) -> int:
+        """The bound of the offset's error."""
+        return self.round_trip_ns // 2
+
+
+class TimeSync:
+    """Asks and answers at one end of a link: a burst at the start, then once a second."""
+
+    def __init__(self, endpoint: Endpoint, clock: Clock) -> None:
+        self._endpoint = endpoint
+        self._clock = clock
+        self._asked: deque[int] = deque(maxlen=_REMEMBERED)
+        self._answers: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
+        self._questions = self._count = 0
+        self.next_ns = 0
+        """When the next question is due, on the clock."""
+
+    def question(self) -> bytes:
+        """The frame of a question asked now."""
+        now_ns = self._clock.now_ns()
+        self._questions += 1
+        self.next_ns = now_ns + (BURST_PERIOD_NS if self._questions < BURST else PERIOD_NS)
+        self._asked.append(now_ns)
+        return self._endpoint.seal(mavlink_map.TIMESYNC, mavlink_map.encode_timesync(0, now_ns))
+
+    def take(self, frame: Frame, arrived_ns: int) -> bytes | None:
+        """Take a TIMESYNC that came at arrived_ns; the frame to answer a question with, else None."""
+        answer_ns, asked_ns = mavlink_map.decode_timesync(frame.payload)
+        if answer_ns == 0:
+            payload = mavlink_map.encode_timesync(self._clock.now_ns(), asked_ns)
+            return self._endpoint.seal(mavlink_map.TIMESYNC, payload)
+        if asked_ns in self._asked and arrived_ns >= asked_ns:
+            self._asked.remove(asked_ns)
+            self._count += 1
+            self._answers.append((arrived_ns - asked_ns, answer_ns - (asked_ns + arrived_ns) // 2))
+        return None
+
+    @property
+    def estimate(self) -> Estimate | None:
+        """The offset by the best of the newest answers; None where none came yet."""
+        if not self._answers:
+            return None
+        round_trip_ns, offset_ns = min(self._answers)
+        return Estimate(offset_ns, round_trip_ns, self._count)

@@ -1,0 +1,100 @@
+"""From time stamps to legs: the rows of both ends joined by the sample they speak of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from bridge.legs import ANSWER_COLUMNS, CONTROLLER_FILE, EMULATOR_FILE, SAMPLE_COLUMNS, TICK_COLUMNS, Rows, load_legs
+from bridge.timesync import Estimate
+
+LEGS = {
+    "wake": "due -> emulator wakes",
+    "sense": "-> measured, stamped",
+    "to_kernel": "-> kernel (controller)",
+    "to_controller": "-> controller wakes",
+    "compute": "-> command computed",
+    "hand_over": "-> sent",
+    "back_to_kernel": "-> kernel (emulator)",
+    "to_emulator": "-> emulator wakes",
+    "apply": "-> applied",
+    "age": "age: stamped -> applied",
+}
+"""Each leg by name, in the order of travel; `age` is that of the sample in the applied command."""
+
+
+class Legs(NamedTuple):
+    """What the stamps of a run say.
+
+    t_ns (n,)      simulation time of the samples that were answered
+    durations_ns   leg -> (n,) ns; a leg that is not known for a sample is -1 there
+    delay_ns (n,)  from the sample to the action of its command, in simulation time
+    clock          TIMESYNC's estimate of the controller's clock less the emulator's, None where nobody answered
+    """
+
+    t_ns: Rows
+    durations_ns: dict[str, Rows]
+    delay_ns: Rows
+    clock: Estimate | None
+
+    def known(self, leg: str) -> Rows:
+        """The durations of a leg, those that are known."""
+        values = self.durations_ns[leg]
+        return values[values >= 0]
+
+
+def join_legs(folder: Path, controller_folder: Path | None = None, *, offset_ns: int = 0) -> Legs:
+    """The legs of a run; offset_ns: the controller's clock less the emulator's, 0 on one machine. Raises RunFolderError."""
+    emulator, clock = load_legs(folder / EMULATOR_FILE)
+    controller, _ = load_legs((controller_folder or folder) / CONTROLLER_FILE)
+    return legs_of(emulator["ticks"], emulator["answers"], controller["samples"], clock, offset_ns=offset_ns)
+
+
+def legs_of(ticks: Rows, answers: Rows, samples: Rows, clock: Estimate | None, *, offset_ns: int = 0) -> Legs:
+    """The legs of rows as `bridge.legs` describes them; samples whose command was never applied are left out."""
+    t_ns = np.intersect1d(np.intersect1d(ticks[:, 0], answers[:, 0]), samples[:, 0])
+    tick = _columns(ticks, t_ns, TICK_COLUMNS)
+    answer = _columns(answers, t_ns, ANSWER_COLUMNS)
+    sample = _columns(samples, t_ns, SAMPLE_COLUMNS)
+    sample = {name: np.where(stamps > 0, stamps - offset_ns, 0) for name, stamps in sample.items()}
+    route = (
+        ("wake", tick["due_ns"], tick["woke_ns"]),
+        ("sense", tick["woke_ns"], tick["sent_ns"]),
+        ("to_kernel", tick["sent_ns"], sample["kernel_ns"]),
+        ("to_controller", sample["kernel_ns"], sample["woke_ns"]),
+        ("compute", sample["woke_ns"], sample["computed_ns"]),
+        ("hand_over", sample["computed_ns"], sample["sent_ns"]),
+        ("back_to_kernel", sample["sent_ns"], answer["kernel_ns"]),
+        ("to_emulator", answer["kernel_ns"], answer["woke_ns"]),
+        ("apply", answer["woke_ns"], answer["applied_ns"]),
+        ("age", tick["sent_ns"], answer["applied_ns"]),
+    )
+    durations = {
+        name: np.where((begun > 0) & (ended > 0), np.maximum(0, ended - begun), -1) for name, begun, ended in route
+    }
+    return Legs(t_ns, durations, answer["acts_ns"] - t_ns, clock)
+
+
+def _columns(rows: Rows, t_ns: Rows, names: tuple[str, ...]) -> dict[str, npt.NDArray[np.int64]]:
+    """The first row of each sample, by column."""
+    _, first = np.unique(rows[:, 0], return_index=True)
+    chosen = rows[first]
+    chosen = chosen[np.searchsorted(chosen[:, 0], t_ns)]
+    return {name: chosen[:, column] for column, name in enumerate(names)}
+
+
+def clock_check(legs: Legs) -> dict[str, Any] | None:
+    """TIMESYNC against the clock that both ends share on one machine: its error beside its bound; us."""
+    if legs.clock is None:
+        return None
+    return {
+        "offset_us": legs.clock.offset_ns / 1e3,
+        "true_offset_us": 0.0,
+        "error_us": abs(legs.clock.offset_ns) / 1e3,
+        "bound_us": legs.clock.error_ns / 1e3,
+        "answers": legs.clock.answers,
+        "held": abs(legs.clock.offset_ns) <= legs.clock.error_ns,
+    }

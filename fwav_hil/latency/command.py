@@ -1,0 +1,176 @@
+"""`fwav-hil latency`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from bridge.command_line import (
+    chosen_scenario,
+    delay_option,
+    duration_option,
+    json_option,
+    law_option,
+    options,
+    rate_option,
+    scenario_argument,
+    seed_option,
+    wait_option,
+)
+from bridge.summary import is_stdout, read_json, show_json, write_json
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rich.console import Console
+
+FREE_PORT = "udpin://127.0.0.1:0"
+EXAMPLE = """
+\b
+Example:
+  fwav-hil latency flapper --rate 500 --duration 60 --against
+  fwav-hil latency flapper --rate 500 --delay 5ms --json delayed.json
+  fwav-hil latency --link serial:///dev/ttyUSB0:921600 --rate 50      an autopilot, by TIMESYNC alone
+  fwav-hil latency --from RUN --controller-from RUN_OF_THE_OTHER_HOST
+"""
+
+
+@click.command("latency", epilog=EXAMPLE)
+@options(
+    scenario_argument, law_option, rate_option, duration_option, seed_option,
+    click.option(
+        "--link", default=FREE_PORT, show_default=True, metavar="URI",
+        help="udpin:// or tcpin://: fly the closed loop on it. Any other link: ask whoever is there, by TIMESYNC.",
+    ),
+    delay_option,
+    click.option("--against", is_flag=True, help="Measure a bare UDP echo, a mavutil script and cyclictest beside it."),
+    click.option(
+        "--from", "folder", type=click.Path(exists=True, file_okay=False, path_type=Path), metavar="DIR",
+        help="Fly nothing: report the run in this folder, flown with --legs.",
+    ),
+    click.option(
+        "--controller-from", "controller_folder", type=click.Path(exists=True, file_okay=False, path_type=Path),
+        metavar="DIR", help="With --from: the controller's folder, where it ran on another machine.",
+    ),
+    click.option(
+        "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
+        help="Folder of the run, its histograms (.hgrm) and the plot; by default a new one in runs/.",
+    ),
+    wait_option, json_option,
+)  # fmt: skip
+def latency(
+    scenario: str, law: str | None, rate: float | None, duration: float | None, seed: int | None, link: str,
+    delay_ns: int, against: bool, folder: Path | None, controller_folder: Path | None, out: Path | None, wait_s: float,
+    json_path: Path | None,
+) -> None:  # fmt: skip
+    """Measure where the time goes between a sample and its command, in the real-time closed loop or on a real link."""
+    from rich.console import Console
+
+    from protocol.errors import UsageError
+
+    to_stderr = is_stdout(json_path)
+    terminal = (sys.stderr if to_stderr else sys.stdout).isatty()
+    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr, width=None if terminal else 120)
+    if controller_folder and not folder:
+        raise UsageError("--controller-from says where the other half of --from DIR is: give both")
+    if folder:
+        _report(folder, controller_folder, {}, console, json_path)
+        return
+    if link.partition("://")[0] not in ("udpin", "tcpin"):
+        _ask(link, rate or 50.0, duration or 10.0, wait_s, console, json_path)
+        return
+    chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
+    from bridge.process import StopFlag
+    from fwav_hil.compile import compile_kernels
+    from fwav_hil.latency.study import beside, closed_loop
+    from fwav_hil.run import new_folder
+
+    compile_kernels(chosen)
+    folder = new_folder(chosen, out)
+    closed_loop(chosen, folder, link=link, delay_ns=delay_ns, wait_s=wait_s)
+    stop = StopFlag()
+    stop.install()
+    with _bar() as told:
+        found = beside(chosen.rate_hz, stop, told, against=against)
+    _report(folder, None, found, console, json_path)
+
+
+def _report(
+    folder: Path, controller_folder: Path | None, found: dict[str, Any], console: Console, json_path: Path | None
+) -> None:
+    """Write and show what the time stamps in a run folder say, beside what else was found."""
+    from fwav_hil.latency.analysis import LEGS
+    from fwav_hil.latency.figures import draw
+    from fwav_hil.latency.study import report_of, write_files
+    from fwav_hil.latency.tables import print_report
+    from fwav_hil.report import FILES
+    from protocol.scenario import load_scenario
+
+    scenario = load_scenario(folder / FILES["scenario"])
+    report, legs = report_of(scenario, read_json(folder / FILES["summary"]), folder, controller_folder)
+    durations = {name: legs.known(name) for name in LEGS}
+    files = write_files(folder, durations)
+    known = legs.durations_ns["age"] >= 0
+    title = f"{scenario.name}, {scenario.law}, {scenario.rate_hz:g} Hz, real time: legs of the loop"
+    series = (legs.t_ns[known] * 1e-9, "age of the sample in the applied command", legs.durations_ns["age"][known])
+    files["plot"] = str(draw(folder / "latency.png", title, durations, series))
+    result = {"mode": "closed_loop", **report, "beside": found, "files": {**files, "run": str(folder)}}
+    write_json(folder / "latency.json", result)
+    print_report(result, console)
+    console.print(f"run folder: {folder}")
+    show_json(json_path, result)
+
+
+def _ask(uri: str, rate_hz: float, seconds: float, wait_s: float, console: Console, json_path: Path | None) -> None:
+    """Probe whoever is at the link by TIMESYNC."""
+    from bridge.process import StopFlag, open_patiently
+    from fwav_hil.latency.histogram import percentiles
+    from fwav_hil.latency.peers import probe_time_sync
+    from fwav_hil.latency.tables import print_probes
+    from protocol.errors import PeerMissingError
+
+    stop = StopFlag()
+    stop.install()
+    count = max(1, round(rate_hz * seconds))
+    with open_patiently(uri, wait_s, stop) as link, _bar() as told:
+        link.stamp_receives()
+        result, clock = probe_time_sync(
+            link, stop, rate_hz=rate_hz, count=count, told=lambda sent: told("asking", sent / count)
+        )
+    if clock is None:
+        raise PeerMissingError(
+            f"nobody at {uri} answered any of {count} TIMESYNC questions: see that an autopilot is there and speaks MAVLink 2"
+        )
+    shown = {
+        "mode": "time_sync",
+        "link": uri,
+        "rate_hz": rate_hz,
+        "round_trip_us": percentiles(result.from_due_ns[result.from_due_ns >= 0]),
+        "from_sent_us": percentiles(result.from_sent_ns[result.from_sent_ns >= 0]),
+        "lost": result.lost,
+        "duplicate": result.duplicates,
+        "out_of_order": result.out_of_order,
+        "clock_offset_us": clock.offset_ns / 1e3,
+        "clock_offset_bound_us": clock.error_ns / 1e3,
+    }
+    print_probes(shown, console)
+    show_json(json_path, shown)
+
+
+class _bar:
+    """A progress bar on a terminal; gives a function of what is done and which share of it."""
+
+    def __enter__(self) -> Callable[[str, float], None]:
+        from rich.console import Console
+        from rich.progress import Progress
+
+        self._progress = Progress(console=Console(stderr=True), disable=not sys.stderr.isatty())
+        self._progress.start()
+        task = self._progress.add_task("probing", total=1.0)
+        return lambda name, share: self._progress.update(task, description=name, completed=share)
+
+    def __exit__(self, *_ended: object) -> None:
+        self._progress.stop()

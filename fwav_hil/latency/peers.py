@@ -1,0 +1,169 @@
+"""Open-loop probes of one link: our own responder, a bare echo, a mavutil script, or whatever autopilot is there."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from bridge.clock import MonotonicClock
+from bridge.endpoint import Endpoint
+from bridge.link import Link, open_link
+from bridge.probes import ProbeResult, probe
+from bridge.process import StopFlag
+from bridge.timesync import Estimate, TimeSync
+from fwav_hil.latency.echo import TICK_BYTES
+from protocol import mavlink_map
+from protocol.errors import PeerMissingError
+from protocol.mavlink_codec import FrameReader, FrameWriter
+from protocol.tick_frames import TickWriter
+
+GROUND_STATION = (255, 190)
+EMULATOR = (1, 191)
+Told = Callable[[int], None]
+
+
+def probe_time_sync(
+    link: Link, stop: StopFlag, *, rate_hz: float, count: int, told: Told
+) -> tuple[ProbeResult, Estimate | None]:
+    """TIMESYNC questions as a ground station asks them; with the other clock's offset by the quickest answer."""
+    clock = MonotonicClock()
+    endpoint = Endpoint(link, *GROUND_STATION)
+    numbers: dict[int, int] = {}
+    best: list[tuple[int, int]] = []
+    others = TimeSync(endpoint, clock)
+
+    def question(number: int) -> bytes:
+        asked_ns = clock.now_ns()
+        numbers[asked_ns] = number
+        return endpoint.seal(mavlink_map.TIMESYNC, mavlink_map.encode_timesync(0, asked_ns))
+
+    def answered(data: bytes) -> list[int]:
+        arrived_ns = link.received_ns or clock.now_ns()
+        found = []
+        for frame in endpoint.reader.read(data):
+            if frame.message_id != mavlink_map.TIMESYNC.message_id:
+                continue
+            answer_ns, asked_ns = mavlink_map.decode_timesync(frame.payload)
+            if answer_ns == 0:  # the other end asks too
+                reply = others.take(frame, arrived_ns)
+                if reply:
+                    link.send(reply)
+                continue
+            found.append(numbers.get(asked_ns, -1))
+            if asked_ns in numbers:
+                best.append((arrived_ns - asked_ns, answer_ns - (asked_ns + arrived_ns) // 2))
+        return found
+
+    result = probe(
+        link,
+        clock,
+        stop,
+        period_ns=round(1e9 / rate_hz),
+        count=count,
+        question=question,
+        answered=answered,
+        progress=told,
+    )
+    if not best:
+        return result, None
+    round_trip_ns, offset_ns = min(best)
+    return result, Estimate(offset_ns, round_trip_ns, len(best))
+
+
+def probe_responder(stop: StopFlag, *, rate_hz: float, count: int, told: Told) -> ProbeResult:
+    """TIMESYNC between two processes of ours over UDP."""
+    with _child("bridge.responder", "udpin://127.0.0.1:0") as said, open_link(said.replace("udpin", "udpout")) as link:
+        link.stamp_receives()
+        return probe_time_sync(link, stop, rate_hz=rate_hz, count=count, told=told)[0]
+
+
+def probe_echo(stop: StopFlag, *, rate_hz: float, count: int, told: Told) -> ProbeResult:
+    """A bare UDP echo: a tick's bytes there, a command's back."""
+
+    def question(number: int) -> bytes:
+        return number.to_bytes(8, "little").ljust(TICK_BYTES, b"x")
+
+    def answered(data: bytes) -> list[int]:
+        return [int.from_bytes(data[:8], "little")]
+
+    return _probe_port("fwav_hil.latency.echo", stop, rate_hz, count, question, answered, told)
+
+
+def probe_mavutil(stop: StopFlag, *, rate_hz: float, count: int, told: Told) -> ProbeResult:
+    """Pose and tick there, HIL_ACTUATOR_CONTROLS back, by a mavutil script at the other end."""
+    period_ns = round(1e9 / rate_hz)
+    ticks, reader = TickWriter(FrameWriter(*EMULATOR)), FrameReader(is_datagram=True)
+    q, readings = np.zeros(6), np.zeros(13)
+
+    def question(number: int) -> bytes:
+        return b"".join(ticks.frames((number + 1) * period_ns, q, readings))
+
+    def answered(data: bytes) -> list[int]:
+        found = []
+        for frame in reader.read(data):
+            if frame.message_id == mavlink_map.COMMAND.message_id:
+                t_us = int.from_bytes(frame.payload[:8].ljust(8, b"\0"), "little")
+                found.append(round(t_us * 1000 / period_ns) - 1)
+        return found
+
+    return _probe_port("protocol.mavutil_peer", stop, rate_hz, count, question, answered, told)
+
+
+def _probe_port(
+    module: str,
+    stop: StopFlag,
+    rate_hz: float,
+    count: int,
+    question: Callable[[int], bytes],
+    answered: Callable[[bytes], list[int]],
+    told: Told,
+) -> ProbeResult:
+    with _child(module) as port, open_link(f"udpout://127.0.0.1:{port}") as link:
+        link.stamp_receives()
+        return probe(
+            link, MonotonicClock(), stop, period_ns=round(1e9 / rate_hz), count=count, question=question,
+            answered=answered, progress=told,
+        )  # fmt: skip
+
+
+@contextmanager
+def _child(module: str, *arguments: str) -> Iterator[str]:
+    """A module of ours as a process; gives the first line it writes, and ends it."""
+    process = subprocess.Popen([sys.executable, "-m", module, *arguments], stdout=subprocess.PIPE, text=True)
+    try:
+        line = process.stdout.readline().strip() if process.stdout else ""
+        if not line:
+            raise PeerMissingError(f"the process `python -m {module}` did not start: run it by itself to see why")
+        yield line
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def cyclictest(rate_hz: float, seconds: float) -> npt.NDArray[np.int64] | None:
+    """Wake-up lateness of cyclictest (Debian rt-tests), ns, whole microseconds; None where it is not installed or refuses.
+
+    It runs at the period of rate_hz, without asking for a priority of its own: as an ordinary process, like ours.
+    """
+    program = shutil.which("cyclictest") or ("/usr/sbin/cyclictest" if Path("/usr/sbin/cyclictest").exists() else None)
+    if program is None:
+        return None
+    period_us, loops = round(1e6 / rate_hz), round(rate_hz * seconds)
+    command = [program, "-q", "--policy=other", "-t1", f"-i{period_us}", f"-l{loops}", "-h100000"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    lateness: list[tuple[int, int]] = []
+    for line in done.stdout.splitlines():
+        words = line.split()
+        if len(words) == 2 and words[0].isdigit() and words[1].isdigit():
+            lateness.append((int(words[0]), int(words[1])))
+    if done.returncode or not lateness:
+        return None
+    values, counts = zip(*lateness, strict=True)
+    return np.repeat(np.array(values, dtype=np.int64) * 1000, counts)

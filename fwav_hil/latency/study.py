@@ -1,0 +1,149 @@
+"""One latency study: the closed loop in real time, probes beside it, and what simulation says of the delay found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from bridge.process import StopFlag
+from fwav_hil.latency.analysis import LEGS, Legs, clock_check, join_legs
+from fwav_hil.latency.histogram import percentiles, write_hgrm
+from fwav_hil.latency.peers import cyclictest, probe_echo, probe_mavutil, probe_responder
+from fwav_hil.run import RunOptions, run
+from fwav_hil.score import scores
+from fwav_hil.simulate import Simulation, simulate
+from protocol.scenario import NANOSECONDS, Delay, Scenario
+
+Told = Callable[[str, float], None]
+"""Hears what is being done, and the share of it that is done."""
+
+PROBE_SECONDS = 5.0
+MISSING_CYCLICTEST = "cyclictest was not found or refused to run: install it with `apt-get install rt-tests`"
+
+
+def closed_loop(scenario: Scenario, folder: Path, *, link: str, delay_ns: int, wait_s: float) -> dict[str, Any]:
+    """Fly the scenario in real time with time stamps; returns the run's summary. Raises what `run` raises."""
+    return run(scenario, folder, RunOptions(clock="realtime", link=link, wait_s=wait_s, delay_ns=delay_ns, legs=True))
+
+
+def leg_report(legs: Legs) -> dict[str, dict[str, float | int | None]]:
+    """Percentiles of every leg, us."""
+    return {name: percentiles(legs.known(name)) for name in LEGS}
+
+
+def write_files(folder: Path, durations_ns: dict[str, npt.NDArray[np.int64]]) -> dict[str, str]:
+    """Write an .hgrm file for each distribution; returns name -> file."""
+    files = {}
+    for name, values in durations_ns.items():
+        if len(values):
+            path = folder / f"latency_{name}.hgrm"
+            write_hgrm(path, values)
+            files[f"{name}_hgrm"] = str(path)
+    return files
+
+
+def losses(summary: dict[str, Any]) -> dict[str, int]:
+    """What went missing or wrong on the way, of both ends, from the counters of a run.
+
+    Where no sample comes in time the controller gives its last answer again, the same frame (`repeated`): that is no
+    duplicate of the link, and not out of order.
+    """
+    emulator, controller = summary["counters"]["emulator"], summary["counters"]["controller"]
+    repeated = controller.get("repeated", 0)
+    return {
+        "lost": emulator.get("sequence_gaps", 0) + controller.get("sequence_gaps", 0),
+        "duplicate": max(0, emulator.get("repeated", 0) + emulator.get("old_commands", 0) - repeated),
+        "out_of_order": controller.get("out_of_order", 0),
+        "repeated": repeated,
+        "unanswered_in_period": emulator.get("unanswered", 0),
+        "missed_deadlines": emulator.get("late", 0),
+        "slipped_periods": emulator.get("slipped", 0),
+    }
+
+
+def prediction(scenario: Scenario, legs: Legs, summary: dict[str, Any]) -> dict[str, Any] | None:
+    """The tracking error that `simulate` predicts, beside the run's: RMSE by axis.
+
+    `constant`: every command delayed by the median age. `recorded`: each by its own delay in the run, in simulation time;
+    a command that did not come never acts.
+    """
+    if not len(legs.t_ns):
+        return None
+    median_s = float(np.median(legs.delay_ns)) / NANOSECONDS
+    delayed = msgspec.structs.replace(scenario, delay=Delay(samples=0, seconds=median_s))
+    delays_ns = np.full(scenario.ticks, -1, dtype=np.int64)
+    delays_ns[legs.t_ns // scenario.period_ns] = legs.delay_ns
+    return {
+        "delay_s": median_s,
+        "rmse_run": summary["rmse"],
+        "rmse_constant": _rmse(delayed, simulate(delayed)),
+        "rmse_recorded": _rmse(scenario, simulate(scenario, delays_ns=delays_ns)),
+    }
+
+
+def _rmse(scenario: Scenario, result: Simulation) -> dict[str, float | None]:
+    rmse: dict[str, float | None] = scores(scenario, result.t_ns, result.q)["rmse"]
+    return rmse
+
+
+def beside(rate_hz: float, stop: StopFlag, told: Told, *, against: bool) -> dict[str, Any]:
+    """Open-loop probes of our own responder and, if asked, of a bare echo and a mavutil script; and cyclictest's wake-ups.
+
+    Values are distributions in us, with the answers lost, doubled and out of order; a note where one could not run.
+    """
+    count = max(100, round(rate_hz * PROBE_SECONDS))
+    probes = {"open_loop": probe_responder}
+    if against:
+        probes |= {"bare_echo": probe_echo, "mavutil": probe_mavutil}
+    found: dict[str, Any] = {}
+    for name, ask in probes.items():
+        result = ask(stop, rate_hz=rate_hz, count=count, told=lambda sent, name=name: told(name, sent / count))  # type: ignore[misc]
+        known = result.from_due_ns[result.from_due_ns >= 0]
+        found[name] = {
+            "from_due": percentiles(known),
+            "from_sent": percentiles(result.from_sent_ns[result.from_sent_ns >= 0]),
+            "lost": result.lost,
+            "duplicate": result.duplicates,
+            "out_of_order": result.out_of_order,
+        }
+    if against:
+        told("cyclictest", 0.0)
+        lateness = cyclictest(rate_hz, PROBE_SECONDS)
+        found["cyclictest"] = {"note": MISSING_CYCLICTEST} if lateness is None else {"wake": percentiles(lateness)}
+    return found
+
+
+def report_of(
+    scenario: Scenario, summary: dict[str, Any], folder: Path, controller_folder: Path | None = None
+) -> tuple[dict[str, Any], Legs]:
+    """The report of a run with time stamps, and its legs; on two machines by TIMESYNC. Raises RunFolderError."""
+    legs = join_legs(folder, controller_folder)
+    if controller_folder and legs.clock:
+        legs = join_legs(folder, controller_folder, offset_ns=legs.clock.offset_ns)
+    report = {
+        "scenario": scenario.name,
+        "law": scenario.law,
+        "rate_hz": scenario.rate_hz,
+        "duration_s": scenario.duration_s,
+        "legs_us": leg_report(legs),
+        "losses": losses(summary),
+        "time_sync": clock_check(legs) if controller_folder is None else _offset_of(legs),
+        "prediction": prediction(scenario, legs, summary),
+        "placement": summary.get("placement", ""),
+    }
+    return report, legs
+
+
+def _offset_of(legs: Legs) -> dict[str, Any] | None:
+    if legs.clock is None:
+        return None
+    return {
+        "offset_us": legs.clock.offset_ns / 1e3,
+        "bound_us": legs.clock.error_ns / 1e3,
+        "answers": legs.clock.answers,
+    }
