@@ -92,6 +92,15 @@ def compiled(function: Kernel) -> Kernel:
         config.CACHE_DIR = place
 
 
+@functools.cache
+def _structure(kinds: tuple[tuple[str, str, tuple[int, ...]], ...]) -> np.dtype[np.void]:
+    """One dtype object for each layout: numba knows the one it has met at once, but compares an equal one field by field.
+
+    That costs some microseconds for each argument of each call.
+    """
+    return np.dtype(list(kinds))
+
+
 def pack(values: Mapping[str, Any]) -> Packed:
     """Arrays, numbers and truth values by name, copied into one structured array of shape (1,).
 
@@ -99,8 +108,8 @@ def pack(values: Mapping[str, Any]) -> Packed:
     read by the same names as a NamedTuple's fields, so a function takes either.
     """
     columns = [(name, np.asarray(value)) for name, value in values.items()]
-    kinds = [(name, np.int64 if array.dtype == bool else array.dtype, array.shape) for name, array in columns]
-    packed = np.zeros(1, dtype=kinds)
+    kinds = tuple((name, "i8" if array.dtype == bool else array.dtype.str, array.shape) for name, array in columns)
+    packed = np.zeros(1, dtype=_structure(kinds))
     for name, array in columns:
         packed[name][0] = array
     return packed
