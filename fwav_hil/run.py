@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import click
 import msgspec
 import numpy as np
 
@@ -16,6 +17,7 @@ from bridge.summary import make_folder, refuse_existing_run, write_text
 from fwav_hil.children import Child, listen
 from fwav_hil.progress import Progress
 from fwav_hil.report import FILES, summarise
+from fwav_hil.studies.margin import budget_line
 from protocol.errors import FwavHilError, Interrupted, PeerError, UsageError
 from protocol.scenario import NANOSECONDS, Scenario
 
@@ -23,12 +25,13 @@ _IN_TO_OUT = {"udpin": "udpout", "tcpin": "tcpout"}
 
 
 class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How the run is made. link: the emulator's URI; the controller gets its counterpart."""
+    """How the run is made. link: the emulator's URI; the controller gets its counterpart. quiet: no line on the budget."""
 
     clock: str = "lockstep"
     link: str = "udpin://127.0.0.1:14560"
     speed: float | None = None
     wait_s: float = 30.0
+    quiet: bool = False
 
 
 class RunFailedError(FwavHilError):
@@ -97,6 +100,7 @@ def check_link(uri: str) -> None:
 def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]:
     """Run both processes; returns the summary, which is also in the folder. Raises RunFailedError, Interrupted, ...
 
+    Before it starts, a line on standard error says how much of the delay that the gains stand is left (`budget_line`).
     Whatever happens the folder keeps what was recorded, no process stays behind, and the summary is written if there is
     anything to sum up.
     """
@@ -104,6 +108,9 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
     scheme, _, address = options.link.partition("://")
     stop = StopFlag()
     stop.install()
+    budget = budget_line(scenario, options.clock)
+    if not options.quiet:
+        click.echo(f"{'warning: ' if budget.warn else ''}{budget.sentence}", err=True)
     placement = choose_placement(options.clock)
     common = [
         str(folder / FILES["scenario"]),
@@ -123,7 +130,8 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
     finally:
         for child in (emulator, controller):
             child.end()
-    summary = summarise(folder, placement=placement.text) if _has_rows(folder) else {}
+    known = msgspec.to_builtins(budget)
+    summary = summarise(folder, placement=placement.text, budget=known) if _has_rows(folder) else {}
     if stop.requested:
         raise Interrupted(f"interrupted: what was recorded until then is in {folder}")
     for child in _culprit_first(emulator, controller):
