@@ -28,6 +28,7 @@ LOST_SATURATED = 0.2
 LOST_ERROR = 0.25
 _NOISES = 10.0
 _LONGEST_S = 1.0
+_SHORTEST_S = 10.0
 
 
 class Flight(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,8 +46,12 @@ class Flight(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def fly(scenario: Scenario, delay_s: float, law: Law | None = None) -> Flight:
-    """Simulate the scenario with this total delay (s, at most 1) in place of its own, and judge it; `law`: made before."""
-    delayed = msgspec.structs.replace(scenario, delay=Delay(samples=0, seconds=delay_s))
+    """Simulate the scenario with this total delay (s, at most 1) in place of its own, and judge it; `law`: made before.
+
+    It lasts as long as the scenario, but 10 s at least (a start-up alone says nothing) and 20 s at most.
+    """
+    duration_s = min(max(scenario.duration_s, _SHORTEST_S), 2.0 * _SHORTEST_S)
+    delayed = msgspec.structs.replace(scenario, delay=Delay(samples=0, seconds=delay_s), duration_s=duration_s)
     return judge_flight(delayed, simulate(delayed, law))
 
 

@@ -115,8 +115,7 @@ class Channel:
         fed_back = self.A + np.outer(self.B_tau, self.C)
         inputs = self.B + np.outer(self.B_tau, self.D)
         inner = np.linalg.solve(z * np.eye(len(self.C)) - fed_back, np.broadcast_to(inputs, (len(z), *inputs.shape)))
-        response: ComplexArray = self.C @ inner + self.D
-        return response
+        return np.asarray(self.C @ inner + self.D, dtype=complex)
 
     def loop(self, delay_s: float, frequency: FloatArray | None = None) -> ComplexArray:
         """L(j omega) for gain 1, broken at the plant's input: 1 + gain L = 0 at a pole. On the grid by default."""

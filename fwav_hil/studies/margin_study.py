@@ -128,7 +128,7 @@ def _amplitude_rows(channel: Channel, gear: Gear, delay_s: float) -> list[Amplit
     rows = []
     for amplitude in amplitudes(gear, _AMPLITUDES):
         relative = describing_function(gear, float(amplitude)) / gear.h
-        if relative == 0.0:
+        if abs(relative) < 1e-9:
             continue  # within its play a gear passes nothing on
         margin = channel_margin(channel, delay_s, complex(channel.ratio * relative))
         rows.append(
