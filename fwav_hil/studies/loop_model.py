@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq
 
-from controller.law import ERROR, ERROR_RATE, POSITION, VELOCITY
+from controller.law import ERROR, ERROR_RATE, POSITION, VELOCITY, Law
 from controller.laws import make_law
 from protocol.messages import AXES, FloatArray
 from protocol.scenario import NANOSECONDS, Scenario
@@ -153,7 +153,12 @@ def _held(period: float, fraction: float) -> tuple[FloatArray, FloatArray]:
 
 def channels(scenario: Scenario) -> dict[str, Channel]:
     """The linear loop of each axis, for the slope h of the gears. Raises UsageError for a law there is not."""
-    law = make_law(scenario.law, scenario).realisation
+    return channels_of(scenario, make_law(scenario.law, scenario))
+
+
+def channels_of(scenario: Scenario, made: Law) -> dict[str, Channel]:
+    """The same for a law that has been made already."""
+    law = made.realisation
     ratios = gain_ratios(scenario)
     loops = {}
     for i, axis in enumerate(AXES):
