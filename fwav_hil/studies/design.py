@@ -43,6 +43,9 @@ SEARCHED = {
 _BOUNDS = {"K": (0.02, 3.0), "Lambda": (0.003, 1.0), "T": (0.2, 30.0), "N": (0.2, 30.0)}
 """Lowest and highest of each, in units of 1/d (T: of d), d being the delay and one and a half periods."""
 
+_POPULATION = 8
+"""Sets of gains in a generation, for each gain searched."""
+
 _PUNISHED = 10.0
 _CLEARLY = 0.03
 """A cell should be better by three per cent, since the seeds of the search are not those of the flights to come."""
@@ -191,9 +194,13 @@ def search(
     """Search attitude, then position; `mapping` makes the map over candidates for a task; `progress` hears each generation.
 
     seed: of the optimiser; the flights' noise has the scenario's seed and those after it. Raises UsageError where no gains
-    within the bounds have the margins.
+    within the bounds have the margins, and for a scenario of less than 4 s.
     """
     names = gains_of(scenario)
+    if scenario.duration_s < 2.0 * SETTLED_S:
+        raise UsageError(
+            f"duration_s {scenario.duration_s:g} is too short to judge gains by: make it {2.0 * SETTLED_S:g} s or more"
+        )
     evaluations = 0
     for group in GROUPS:
         limits = bounds(scenario, names)
@@ -209,7 +216,7 @@ def search(
             Bounds(low, high),
             x0=np.clip(own, low, high),
             rng=np.random.default_rng([seed, group.axes[0]]),
-            popsize=8,
+            popsize=_POPULATION,
             maxiter=generations,
             tol=1e-4,
             init="sobol",

@@ -120,7 +120,7 @@ def scenario_text(result: Design, base_path: Path, out: Path) -> str:
     names = gains_of(designed)
     lines = [
         f"# {', '.join(names)} of [control] are designed, by `fwav-hil design`, for a link of {start.rate_hz:g} Hz with",
-        f"# {delay_ms:g} ms of total delay, and the noise and limits below; optimiser seed {result.seed}, "
+        f"# {delay_ms:g} ms of total delay, and {start.name}'s noise and limits; optimiser seed {result.seed}, "
         f"{result.generations} generations, {result.flights} flights each.",
         f"# Gain margin at least {_least(m.gain_margin for m in result.margins.values()):.2f} both ways, largest delay "
         f"{1e3 * _least(m.max_delay_s for m in result.margins.values()):.1f} ms. Everything else is {start.name}'s.",

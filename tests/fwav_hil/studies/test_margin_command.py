@@ -84,6 +84,8 @@ def test_the_papers_gains_at_100_hz_are_unusable(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(margin_study, "VARIANTS", ())
+    monkeypatch.setattr(margin_study, "_REGION_DELAYS", 4)
+    monkeypatch.setattr(margin_study, "RATES_HZ", (100.0,))
     file = tmp_path / "paper.json"
     ended = call(capsys, "paper", "--rate", "100", "--json", str(file))
     assert ended.code == 0
@@ -98,6 +100,7 @@ def test_any_cell_can_be_asked_for(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(margin_study, "VARIANTS", ())
+    monkeypatch.setattr(margin_study, "_REGION_DELAYS", 4)
     monkeypatch.setattr(margin_study, "RATES_HZ", (500.0,))
     file = tmp_path / "cell.json"
     options = ("--law", "pd", "--rate", "500", "--gain-ratio", "1.5", "--n-filter", "300")
