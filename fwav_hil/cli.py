@@ -37,6 +37,8 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "controller": ("controller.command:controller", "Run the controller alone."),
         "latency": ("fwav_hil.latency.command:latency", "Measure where the time goes in the loop or on a link."),
         "paper": ("fwav_hil.studies.paper_command:paper_command", "Run the source paper's section IV again."),
+        "margin": ("fwav_hil.studies.margin_command:margin_command", "Say whether the gains stand the link."),
+        "design": ("fwav_hil.studies.design_command:design_command", "Search gains for a link."),
         "report": ("fwav_hil.cli:report_command", "Score and plot a run folder again."),
     }
 )

@@ -47,8 +47,11 @@ _REFUSED = (
 )
 
 
-def summarise(folder: Path, *, placement: str = "") -> dict[str, Any]:
-    """Score the run in `folder`, write summary.json there and return it. Raises RunFolderError, ScenarioError."""
+def summarise(folder: Path, *, placement: str = "", budget: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Score the run in `folder`, write summary.json there and return it. Raises RunFolderError, ScenarioError.
+
+    `placement` and `budget` are what only the run itself knows; without them what the summary says stands.
+    """
     scenario = load_scenario(folder / FILES["scenario"])
     truth = load_truth(folder / FILES["ground_truth"])
     emulator, controller = read_json(folder / FILES["emulator"]), read_json(folder / FILES["controller"])
@@ -72,6 +75,7 @@ def summarise(folder: Path, *, placement: str = "") -> dict[str, Any]:
             **ends,
         },
         "placement": placement or before.get("placement", ""),
+        "budget": budget or before.get("budget"),
         "error": emulator.get("error") or controller.get("error"),
         "files": {name: str(folder / file) for name, file in FILES.items() if (folder / file).exists()},
     }

@@ -7,6 +7,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+import click
 import msgspec
 import numpy as np
 
@@ -17,6 +18,7 @@ from bridge.summary import make_folder, refuse_existing_run, write_text
 from fwav_hil.children import Child, listen
 from fwav_hil.progress import Progress
 from fwav_hil.report import FILES, summarise
+from fwav_hil.studies.margin import budget_line
 from protocol.errors import FwavHilError, Interrupted, PeerError, UsageError
 from protocol.scenario import NANOSECONDS, Scenario
 
@@ -26,7 +28,8 @@ _IN_TO_OUT = {"udpin": "udpout", "tcpin": "tcpout"}
 class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     """How the run is made. link: the emulator's URI; the controller gets its counterpart.
 
-    show_progress: False where the caller shows its own. delay_ns, legs: see `EmulatorOptions`.
+    show_progress: False where the caller shows its own, and wants no line on the budget. delay_ns, legs: see
+    `EmulatorOptions`.
     """
 
     clock: str = "lockstep"
@@ -104,6 +107,7 @@ def check_link(uri: str) -> None:
 def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]:
     """Run both processes; returns the summary, which is also in the folder. Raises RunFailedError, Interrupted, ...
 
+    Before it starts, a line on standard error says how much of the delay that the gains stand is left (`budget_line`).
     Whatever happens the folder keeps what was recorded, no process stays behind, and the summary is written if there is
     anything to sum up.
     """
@@ -111,6 +115,9 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
     scheme, _, address = options.link.partition("://")
     stop = StopFlag()
     stop.install()
+    budget = budget_line(scenario, options.clock)
+    if options.show_progress:
+        click.echo(f"{'warning: ' if budget.warn else ''}{budget.sentence}", err=True)
     placement = choose_placement(options.clock)
     common = [
         str(folder / FILES["scenario"]),
@@ -134,7 +141,8 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
     finally:
         for child in (emulator, controller):
             child.end()
-    summary = summarise(folder, placement=placement.text) if _has_rows(folder) else {}
+    known = msgspec.to_builtins(budget)
+    summary = summarise(folder, placement=placement.text, budget=known) if _has_rows(folder) else {}
     if stop.requested:
         raise Interrupted(f"interrupted: what was recorded until then is in {folder}")
     for child in _culprit_first(emulator, controller):

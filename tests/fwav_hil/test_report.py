@@ -89,6 +89,13 @@ def test_which_run_it_was(folder: Path) -> None:
     assert {key: summary[key] for key in expected} == expected
 
 
+def test_what_only_the_run_knew_stands_when_it_is_scored_again(folder: Path) -> None:
+    budget = {"max_delay_s": 0.024, "warn": False}
+    summarise(folder, placement="side by side", budget=budget)
+    again = summarise(folder)
+    assert (again["placement"], again["budget"]) == ("side by side", budget)
+
+
 def test_how_well_it_flew(folder: Path) -> None:
     summary = summarise(folder)
     for name in ("rmse", "mae", "rmse_settled", "mae_settled"):

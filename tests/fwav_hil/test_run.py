@@ -17,12 +17,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
+import fwav_hil.run
 from bridge.clock import MonotonicClock
+from fwav_hil.run import RunOptions
 from fwav_hil.simulate import simulate
+from fwav_hil.studies.margin import budget_line
 from plant_emulator.truth import load_truth
+from protocol.errors import FwavHilError
 from tests.loop import scenario_of
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(150)]
@@ -36,7 +41,7 @@ def command(*arguments: str | Path) -> list[str]:
     return [sys.executable, "-m", "fwav_hil", *map(str, arguments)]
 
 
-def fwav_hil(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+def call(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         command(*arguments), cwd=cwd, env=environment(), capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
@@ -99,7 +104,7 @@ def compiled_kernels() -> None:
 
 def test_two_runs_and_the_simulation_agree_to_the_byte(tmp_path: Path) -> None:
     for name in ("first", "second"):
-        done = fwav_hil("run", "flapper", "--duration", "2", "--link", FREE, "--out", name, "--no-plots", cwd=tmp_path)
+        done = call("run", "flapper", "--duration", "2", "--link", FREE, "--out", name, "--no-plots", cwd=tmp_path)
         assert done.returncode == 0, done.stderr
     for file in ("run.tlog", "ground_truth.npy"):
         assert (tmp_path / "first" / file).read_bytes() == (tmp_path / "second" / file).read_bytes(), file
@@ -113,7 +118,7 @@ def test_two_runs_and_the_simulation_agree_to_the_byte(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rate", [250, 500])
 def test_flapper_tracks_within_its_bounds(rate: int, tmp_path: Path) -> None:
-    done = fwav_hil(
+    done = call(
         "run", "flapper", "--rate", str(rate), "--link", FREE, "--json", "result.json", "--out", "run", cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr
@@ -130,12 +135,36 @@ def test_flapper_tracks_within_its_bounds(rate: int, tmp_path: Path) -> None:
     assert [result["counters"][name] for name in ("missed", "dropped", "refused")] == [0, 0, 0]
     for path in result["files"].values():
         assert (tmp_path / path).exists(), path
+    budget = budget_line(scenario_of("flapper", rate_hz=float(rate)))
+    assert done.stderr.count(budget.sentence) == 1
+    assert "warning: delay budget" not in done.stderr
+    assert result["budget"] == msgspec.to_builtins(budget)
     for plot in ("tracking", "error", "command", "hysteresis"):
         assert (tmp_path / "run" / f"{plot}.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("quiet", [False, True])
+def test_a_budget_that_is_all_but_used_up_is_a_warning_before_anything_starts(
+    quiet: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class NoProcessError(FwavHilError):
+        pass
+
+    def refuse(*_: object) -> None:
+        raise NoProcessError
+
+    monkeypatch.setattr(fwav_hil.run, "Child", refuse)
+    monkeypatch.setattr("fwav_hil.run.StopFlag.install", lambda _: None)
+    options = RunOptions(clock="realtime", quiet=quiet)
+    with pytest.raises(NoProcessError):
+        fwav_hil.run.run(scenario_of("paper", rate_hz=200.0), tmp_path, options)
+    told = capsys.readouterr().err
+    assert ("warning: delay budget (ude, 200 Hz): the gains stand 3.38 ms" in told) != quiet
+    assert ("unstable" in told) != quiet
+
+
 def test_the_paper_s_run_is_stable_and_follows(tmp_path: Path) -> None:
-    done = fwav_hil("run", "paper", "--link", FREE, "--json", "result.json", "--no-plots", cwd=tmp_path)
+    done = call("run", "paper", "--link", FREE, "--json", "result.json", "--no-plots", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["ticks"] == 10_000
@@ -145,7 +174,7 @@ def test_the_paper_s_run_is_stable_and_follows(tmp_path: Path) -> None:
 
 
 def test_mavlogdump_reads_the_log(tmp_path: Path) -> None:
-    done = fwav_hil("run", "--duration", "0.4", "--link", FREE, "--out", "run", "--no-plots", cwd=tmp_path)
+    done = call("run", "--duration", "0.4", "--link", FREE, "--out", "run", "--no-plots", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     tool = Path(sys.executable).with_name("mavlogdump.py")
     assert tool.exists(), "pymavlink brings this tool"
@@ -180,7 +209,7 @@ def test_a_run_is_two_processes_and_a_tcp_link_serves_as_well(tmp_path: Path) ->
 
 
 def test_real_time_follows_too(tmp_path: Path) -> None:
-    done = fwav_hil("run", "--clock", "realtime", "--rate", "100", "--duration", "1.5", "--link", FREE,
+    done = call("run", "--clock", "realtime", "--rate", "100", "--duration", "1.5", "--link", FREE,
                     "--json", "result.json", "--no-plots", cwd=tmp_path)  # fmt: skip
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "result.json").read_text())
@@ -193,7 +222,7 @@ def test_a_taken_port_is_one_sentence(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         link = f"udpin://127.0.0.1:{taken.getsockname()[1]}"
-        done = fwav_hil("run", "--link", link, "--out", "run", cwd=tmp_path)
+        done = call("run", "--link", link, "--out", "run", cwd=tmp_path)
     assert done.returncode == 3
     assert_one_line(done.stderr, "taken", str(link.rpartition(":")[2]))
     assert not processes_of(tmp_path)
@@ -205,7 +234,7 @@ def test_a_taken_port_is_one_sentence(tmp_path: Path) -> None:
     [("emulator", "udpin://127.0.0.1:0", "no controller came"), ("controller", "udpout://127.0.0.1:9", "no emulator")],
 )
 def test_a_missing_peer_is_one_sentence(end: str, link: str, part: str, tmp_path: Path) -> None:
-    done = fwav_hil(end, "flapper", "--link", link, "--wait", "0.5", cwd=tmp_path)
+    done = call(end, "flapper", "--link", link, "--wait", "0.5", cwd=tmp_path)
     assert done.returncode == 4
     assert_one_line(done.stderr, part, "--wait")
 
@@ -213,7 +242,7 @@ def test_a_missing_peer_is_one_sentence(end: str, link: str, part: str, tmp_path
 def test_a_divergence_is_one_sentence_and_the_log_goes_up_to_it(tmp_path: Path) -> None:
     late = (ROOT / "scenarios" / "flapper.toml").read_text().replace("samples = 1", "samples = 6")  # 29 ms: too much
     (tmp_path / "late.toml").write_text(late)
-    done = fwav_hil("run", "late.toml", "--link", FREE, "--out", "run", "--no-plots", cwd=tmp_path)
+    done = call("run", "late.toml", "--link", FREE, "--out", "run", "--no-plots", cwd=tmp_path)
     assert done.returncode == 5
     assert_one_line(done.stderr, "diverged")
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
@@ -287,7 +316,7 @@ def test_both_ends_start_alone_as_the_readme_says(tmp_path: Path) -> None:
     )
     with started(*emulator_arguments, cwd=tmp_path) as emulator:
         link = f"udpout://127.0.0.1:{port}"
-        controller = fwav_hil("controller", "flapper", "--link", link, "--law", "ude", "--rate", "500", cwd=tmp_path)
+        controller = call("controller", "flapper", "--link", link, "--law", "ude", "--rate", "500", cwd=tmp_path)
         _, errors = emulator.communicate(timeout=PATIENCE_S)
     assert (controller.returncode, emulator.returncode) == (0, 0), controller.stderr + errors
     assert len(load_truth(tmp_path / "run" / "ground_truth.npy")) == 250
