@@ -155,7 +155,7 @@ def test_a_budget_that_is_all_but_used_up_is_a_warning_before_anything_starts(
 
     monkeypatch.setattr(fwav_hil.run, "Child", refuse)
     monkeypatch.setattr("fwav_hil.run.StopFlag.install", lambda _: None)
-    options = RunOptions(clock="realtime", quiet=quiet)
+    options = RunOptions(clock="realtime", show_progress=not quiet)
     with pytest.raises(NoProcessError):
         fwav_hil.run.run(scenario_of("paper", rate_hz=200.0), tmp_path, options)
     told = capsys.readouterr().err
