@@ -18,6 +18,7 @@ from bridge.command_line import (
     duration_option,
     json_option,
     law_option,
+    log_error_option,
     options,
     rate_option,
     scenario_argument,
@@ -34,6 +35,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "emulator": ("plant_emulator.command:emulator", "Run the plant emulator alone."),
         "controller": ("controller.command:controller", "Run the controller alone."),
         "paper": ("fwav_hil.studies.paper_command:paper_command", "Run the source paper's section IV again."),
+        "record": ("fwav_hil.record_command:record_command", "Record what comes over a live link, sending nothing."),
         "report": ("fwav_hil.cli:report_command", "Score and plot a run folder again."),
     }
 )
@@ -104,6 +106,7 @@ plots_option = click.option("--plots/--no-plots", default=True, show_default=Tru
     ),
     wait_option,
     out_option,
+    log_error_option,
     plots_option,
     json_option,
 )  # fmt: skip
@@ -118,6 +121,7 @@ def run_command(
     link: str,
     wait_s: float,
     out: Path | None,
+    on_log_error: str,
     plots: bool,
     json_path: Path | None,
 ) -> None:
@@ -135,7 +139,8 @@ def run_command(
     compile_kernels(chosen)
     folder = new_folder(chosen, out)
     try:
-        run(chosen, folder, RunOptions(clock=clock, link=link, speed=speed, wait_s=wait_s))
+        run_options = RunOptions(clock=clock, link=link, speed=speed, wait_s=wait_s, on_log_error=on_log_error)
+        run(chosen, folder, run_options)
     except FwavHilError:
         # The run's own error is the one to end with, whatever else its folder gives trouble with.
         with contextlib.suppress(FwavHilError):

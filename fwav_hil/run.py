@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     speed: float | None = None
     wait_s: float = 30.0
     show_progress: bool = True
+    on_log_error: str = "stop"
 
 
 class RunFailedError(FwavHilError):
@@ -120,7 +122,8 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
         str(options.wait_s),
     ]
     speed = ["--speed", str(options.speed)] if options.speed else []
-    emulator = Child("plant_emulator", [*common, *placement.emulator, "--link", f"{scheme}://{address}", *speed])
+    flight = ["--link", f"{scheme}://{address}", *speed, "--on-log-error", options.on_log_error]
+    emulator = Child("plant_emulator", [*common, *placement.emulator, *flight])
     # The controller learns its link when the emulator has opened its own: were the port another run's, it must not go there.
     controller = Child("controller", [*common, *placement.controller, "--link", "-", "--arm"])
     try:
@@ -150,6 +153,8 @@ def _watch(scenario: Scenario, emulator: Child, controller: Child, stop: StopFla
                 told = True
                 scheme, _, address = event["link"].partition("://")
                 controller.tell(f"{_IN_TO_OUT[scheme]}://{address}")
+            elif kind == "warning":
+                sys.stderr.write(event["text"] + "\n")
             elif progress and child is emulator and kind == "progress":
                 progress.update(event["t_ns"] / NANOSECONDS, _error_now(scenario, event["t_ns"], event["q"]))
             if stop.requested or any(one.process.poll() for one in (emulator, controller)):

@@ -13,6 +13,7 @@ from bridge.command_line import (
     clock_option,
     duration_option,
     json_option,
+    log_error_option,
     options,
     process_options,
     rate_option,
@@ -49,6 +50,7 @@ Example:
         "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
         help="Folder for the log, the ground truth and the counters.",
     ),
+    log_error_option,
     json_option,
     process_options,
 )  # fmt: skip
@@ -62,6 +64,7 @@ def emulator(
     seed: int | None,
     wait_s: float,
     out: Path | None,
+    on_log_error: str,
     json_path: Path | None,
     status: str,
     core: int | None,
@@ -73,6 +76,8 @@ def emulator(
     report, stop = begin_process(status, core, with_parent=with_parent)
     from plant_emulator.process import EmulatorOptions, run_emulator
 
-    run_options = EmulatorOptions(link=link, clock=clock, speed=speed, out=out, wait_s=wait_s, spin_s=spin_us * 1e-6)
+    run_options = EmulatorOptions(
+        link=link, clock=clock, speed=speed, out=out, wait_s=wait_s, spin_s=spin_us * 1e-6, on_log_error=on_log_error
+    )
     summary = run_emulator(chosen, run_options, report, stop)
     show_json(json_path, {"scenario": chosen.name, "rate_hz": chosen.rate_hz, "seed": chosen.seed, **summary})

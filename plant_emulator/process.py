@@ -14,6 +14,8 @@ from bridge.link import Link
 from bridge.memory import memory_pair
 from bridge.process import Report, StopFlag, open_patiently
 from bridge.rate import RateKeeper
+from bridge.recorder import Recorder
+from bridge.sidecar import LinkOfLog
 from bridge.summary import make_folder, percentiles_us, refuse_existing_run, write_json, write_text
 from plant_emulator.emulator import Emulator
 from plant_emulator.pacing import Lockstep, Pacing, RealTime
@@ -35,6 +37,7 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     """How the process runs.
 
     speed: lockstep paced to that multiple of real time (None: as fast as it goes). spin_s: see `Link.spin_s`.
+    on_log_error: what a disk that refuses means for the run: "stop", or "continue" with what can be recorded.
     """
 
     link: str
@@ -43,6 +46,7 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     out: Path | None = None
     wait_s: float = 30.0
     spin_s: float = 0.0
+    on_log_error: str = "stop"
 
 
 def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
@@ -63,9 +67,7 @@ def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report
     try:
         if options.out:
             refuse_existing_run(options.out)
-            make_folder(options.out)
-            write_text(options.out / "scenario.toml", scenario.to_toml())
-            log, truth = TlogWriter(options.out / "run.tlog"), TruthWriter(options.out / "ground_truth.npy")
+            log, truth = _open_files(scenario, link, options, options.out, report)
         endpoint = Endpoint(link, VEHICLE[0], scenario.wire.emulator_component)
         emulator = Emulator(scenario, endpoint, truth)
         pacing = _pacing(scenario, options, emulator, endpoint, log, MonotonicClock(), stop)
@@ -75,6 +77,40 @@ def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report
         return _run_ticks(scenario, emulator, pacing, options.out, report)
     finally:
         _close_files(log, truth)
+
+
+def _open_files(
+    scenario: Scenario, link: Link, options: EmulatorOptions, out: Path, report: Report
+) -> tuple[TlogWriter | None, TruthWriter | None]:
+    """Begin the log and the ground truth of a run; None each where the disk refuses and the user chose to go on."""
+
+    def tell(sentence: str) -> None:
+        report({"event": "warning", "text": f"{sentence}; the run goes on"})
+
+    goes_on = options.on_log_error == "continue"
+    source = {
+        "scenario": scenario.name,
+        "law": scenario.law,
+        "seed": scenario.seed,
+        "rate_hz": scenario.rate_hz,
+        "duration_s": scenario.duration_s,
+        "digest": scenario.digest().hex(),
+        "clock": options.clock,
+    }
+    links = (LinkOfLog(link.uri, sent_by=((VEHICLE[0], scenario.wire.emulator_component),)),)
+    stamps = "simulation time" if options.clock == "lockstep" else "Unix time"
+    log = truth = None
+    try:
+        make_folder(out)
+        write_text(out / "scenario.toml", scenario.to_toml())
+        truth = TruthWriter(out / "ground_truth.npy", tell=tell if goes_on else None)
+        log = Recorder(out / "run.tlog", links, stamps=stamps, source=source, tell=tell if goes_on else None)
+    except RunFolderError as error:
+        if not goes_on:
+            _close_files(log, truth)
+            raise
+        tell(str(error))
+    return log, truth
 
 
 def warm_up(scenario: Scenario) -> None:
@@ -176,15 +212,19 @@ def _run_ticks(
         error = stopped
     wall_ns = clock.now_ns() - begun_ns
     _say_farewell(emulator, pacing, done * period_ns)
+    counters = {**emulator.all_counters(), **pacing.counters}
     summary = {
         "clock": "realtime" if isinstance(pacing, RealTime) else "lockstep",
         "ticks": done,
         "wall_s": wall_ns / NANOSECONDS,
         "latency_us": percentiles_us(pacing.latencies_ns),
         "tick_us": percentiles_us(ticks_ns),
-        "counters": {**emulator.all_counters(), **pacing.counters},
+        "counters": counters,
         "error": str(error) if error else None,
     }
+    if isinstance(pacing.log, Recorder):
+        pacing.log.sidecar["counters"] = counters
+        pacing.log.sidecar["links"][0]["peer"] = pacing.endpoint.link.peer
     if out:
         write_json(out / "emulator.json", summary)
     report({"event": "ended", **summary})

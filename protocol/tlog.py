@@ -9,6 +9,7 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
+from typing import Self
 
 from protocol.errors import RunFolderError
 from protocol.log_scan import scan_tlog
@@ -53,7 +54,7 @@ class TlogWriter:
             finally:
                 self._file.close()
 
-    def __enter__(self) -> TlogWriter:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
