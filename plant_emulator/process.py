@@ -72,7 +72,7 @@ def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report
         emulator = Emulator(scenario, endpoint, truth)
         pacing = _pacing(scenario, options, emulator, endpoint, log, MonotonicClock(), stop)
         report({"event": "waiting", "link": link.uri})
-        _meet_controller(scenario, options, endpoint, stop)
+        meet_controller(scenario, options.wait_s, endpoint, stop)
         report({"event": "started", "peer": link.peer})
         return _run_ticks(scenario, emulator, pacing, options.out, report)
     finally:
@@ -144,12 +144,12 @@ def _pacing(
     )  # fmt: skip
 
 
-def _meet_controller(scenario: Scenario, options: EmulatorOptions, endpoint: Endpoint, stop: StopFlag) -> None:
-    """Hold the plant at t = 0 until a controller with the same scenario says it is armed."""
+def meet_controller(scenario: Scenario, wait_s: float, endpoint: Endpoint, stop: StopFlag) -> None:
+    """Hold the plant at t = 0 until a controller with the same scenario says it is armed. Raises PeerError, Interrupted."""
     digest = scenario.digest()
     agreed = heard = False
     clock = MonotonicClock()
-    give_up_ns = clock.now_ns() + round(options.wait_s * NANOSECONDS)
+    give_up_ns = clock.now_ns() + round(wait_s * NANOSECONDS)
     due = Due(1.0 / HELLO_PERIOD_S)
     while (now_ns := clock.now_ns()) < give_up_ns:
         stop.check()
@@ -178,10 +178,10 @@ def _meet_controller(scenario: Scenario, options: EmulatorOptions, endpoint: End
     uri = endpoint.link.uri
     if heard:
         raise PeerMissingError(
-            f"the controller at {endpoint.link.peer} did not arm within {options.wait_s:g} s: start it with --arm"
+            f"the controller at {endpoint.link.peer} did not arm within {wait_s:g} s: start it with --arm"
         )
     raise PeerMissingError(
-        f"no controller came to {uri} within {options.wait_s:g} s: start one with `fwav-hil controller "
+        f"no controller came to {uri} within {wait_s:g} s: start one with `fwav-hil controller "
         f"SCENARIO --link {uri.replace('in://', 'out://', 1)}`, or wait longer with --wait"
     )
 

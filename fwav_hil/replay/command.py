@@ -8,8 +8,8 @@ from typing import Any
 import click
 
 from bridge.command_line import json_option, law_option, options, wait_option
-from bridge.summary import is_stdout, show_json
-from protocol.errors import UsageError
+from bridge.summary import is_stdout, show_json, write_json
+from protocol.errors import RunFolderError, UsageError
 
 EXAMPLE = """
 \b
@@ -18,6 +18,8 @@ Example:
   fwav-hil replay runs/flapper-ude-2026-11-22T14-05-09 --into controller --fast
   fwav-hil replay runs/flapper-ude-2026-11-22T14-05-09 --into controller --law pd
 """
+DIFFERENT = 1
+"""Exit code where a replay, or the other log, differs."""
 SLOWEST, FASTEST = 0.1, 100.0
 
 
@@ -151,4 +153,42 @@ def _replay_into(
     wait_s: float,
     json_path: Path | None,
 ) -> int:
-    raise NotImplementedError
+    from bridge.process import StopFlag
+    from fwav_hil.compile import compile_kernels
+    from fwav_hil.replay.difference import plot_difference, print_difference
+    from fwav_hil.replay.recorded import recorded_run
+
+    stop = StopFlag()
+    stop.install()
+    run = recorded_run(log, scenario, law)
+    if into == "controller":
+        from fwav_hil.replay import into_controller as end
+    else:
+        from fwav_hil.replay import into_emulator as end  # type: ignore[no-redef]
+    compile_kernels(run.scenario)
+    difference = end.replay_in_process(run) if fast else end.replay_into_process(run, wait_s, stop)
+    title = f"{run.log} into {into} ({run.scenario.name}, law {run.scenario.law})"
+    result = {
+        "log": str(run.log), "into": into, "scenario": run.scenario.name, "law": run.scenario.law,
+        "clock": "lockstep" if run.lockstep else "realtime", "difference": not difference.is_zero,
+        **difference.figures(),
+    }  # fmt: skip
+    print_difference(difference, title, to_stderr=is_stdout(json_path))
+    if not difference.is_zero and len(difference.t_ns):
+        folder = _report_folder(out, f"replay-{run.scenario.name}-{run.scenario.law}")
+        plot_difference(difference, title, folder / "difference.png")
+        write_json(folder / "difference.json", result)
+        click.echo(f"report: {folder}", err=is_stdout(json_path))
+    show_json(json_path, result)
+    return 0 if difference.is_zero else DIFFERENT
+
+
+def _report_folder(out: Path | None, name: str) -> Path:
+    from bridge.clock import local_stamp
+    from bridge.summary import make_folder
+
+    folder = out or Path("runs") / f"{name}-{local_stamp()}"
+    if (folder / "difference.png").exists():
+        raise RunFolderError(f"{folder} holds a report already, which stays: choose another folder with --out")
+    make_folder(folder)
+    return folder
