@@ -8,7 +8,6 @@ from __future__ import annotations
 import abc
 import time
 
-
 LEAST_EARLY_NS = 100_000
 MOST_EARLY_NS = 20_000_000
 """Bounds of how long before its moment a `PunctualClock` wakes."""

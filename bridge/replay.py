@@ -68,9 +68,9 @@ class Player:
 
     def play(self, *, loop: bool = False) -> None:
         """Play to the end, or for ever; returns early where `stop` was called. Raises what prepare, send and look do."""
-        while not self._stopped:
+        while True:
             self._play_pass()
-            if self._stopped or self.at < len(self._times):
+            if self.at < len(self._times):
                 return
             self.passes += 1
             if not loop:

@@ -36,7 +36,11 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "controller": ("controller.command:controller", "Run the controller alone."),
         "paper": ("fwav_hil.studies.paper_command:paper_command", "Run the source paper's section IV again."),
         "record": ("fwav_hil.record_command:record_command", "Record what comes over a live link, sending nothing."),
-        "replay": ("fwav_hil.replay.command:replay_command", "Replay a log: to a link, into a controller, into the plant."),
+        "replay": (
+            "fwav_hil.replay.command:replay_command",
+            "Replay a log: to a link, into a controller, into the plant.",
+        ),
+        "diff": ("fwav_hil.replay.diff_command:diff_command", "Compare two logs, sample by sample."),
         "report": ("fwav_hil.cli:report_command", "Score and plot a run folder again."),
     }
 )

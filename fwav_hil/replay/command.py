@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -23,20 +22,17 @@ DIFFERENT = 1
 SLOWEST, FASTEST = 0.1, 100.0
 
 
-class _Speed(click.ParamType):
-    name = "speed"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | None:
-        """A factor, or None for `max`."""
-        if value in ("max", 0.0):
-            return 0.0
-        try:
-            factor = float(value)
-        except ValueError:
-            factor = -1.0
-        if not SLOWEST <= factor <= FASTEST:
-            self.fail(f"{value} is no speed: write a number from {SLOWEST:g} to {FASTEST:g}, or max", param, ctx)
-        return factor
+def _speed(_context: click.Context, _option: click.Parameter, text: str) -> float | None:
+    """A factor, or None for `max`."""
+    if text == "max":
+        return None
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = -1.0
+    if not SLOWEST <= factor <= FASTEST:
+        raise click.BadParameter(f"{text} is no speed: write a number from {SLOWEST:g} to {FASTEST:g}, or max")
+    return factor
 
 
 @click.command("replay", epilog=EXAMPLE)
@@ -54,7 +50,7 @@ class _Speed(click.ParamType):
         "--from", "begin", metavar="TIME", help="Where to begin: seconds since the log began, or HH:MM:SS (UTC).",
     ),
     click.option(
-        "--speed", type=_Speed(), default=1.0, show_default=True, metavar="X|max",
+        "--speed", callback=_speed, default="1", show_default=True, metavar="X|max",
         help="Of log time: 0.1 to 100, or max, as fast as it goes.",
     ),
     click.option("--types", multiple=True, metavar="NAME,...", help="Only these messages."),
@@ -88,7 +84,7 @@ def replay_command(
     targets: tuple[str, ...],
     into: str | None,
     begin: str | None,
-    speed: float,
+    speed: float | None,
     types: tuple[str, ...],
     systems: tuple[str, ...],
     loop: bool,
@@ -112,7 +108,9 @@ def replay_command(
     uris = [target for target in targets if "://" in target]
     ends = [target for target in targets if "://" not in target]
     if len(uris) > 1 or len(ends) > 1 or (len(uris) == 1) == (into is not None):
-        raise UsageError("say where to replay once: --to URI (and --to TIME for the end), or --into controller|emulator")
+        raise UsageError(
+            "say where to replay once: --to URI (and --to TIME for the end), or --into controller|emulator"
+        )
     if into:
         return _replay_into(
             log, into, law=law, scenario=scenario, fast=fast, out=out, wait_s=wait_s, json_path=json_path
@@ -124,11 +122,9 @@ def replay_command(
     stop = StopFlag()
     stop.install()
     scan = open_log(log)
-    choice = Choice(
-        begin=begin, end=ends[0] if ends else None, types=split_names(types), systems=split_names(systems)
-    )
+    choice = Choice(begin=begin, end=ends[0] if ends else None, types=split_names(types), systems=split_names(systems))
     how = ReplayOptions(
-        speed=speed or None, loop=loop, max_gap_s=max_gap_s, rewrite_time=rewrite_time, signing_key=signing_key,
+        speed=speed, loop=loop, max_gap_s=max_gap_s, rewrite_time=rewrite_time, signing_key=signing_key,
         wait_s=wait_s,
     )  # fmt: skip
     result = replay_to(scan, choose(scan, choice), uris[0], how, stop)

@@ -100,7 +100,9 @@ def plot_difference(difference: Difference, title: str, path: Path) -> None:
     t = difference.t_ns * 1e-9
     for axis, (name, factor, unit) in enumerate(_SHOWN[difference.what]):
         above, below = (panels[2 * (axis // 3) + row][axis % 3] for row in (0, 1))
-        above.plot(t, factor * difference.recorded[:, axis], color=REFERENCE, linewidth=2.2, alpha=0.7, label="recorded")
+        above.plot(
+            t, factor * difference.recorded[:, axis], color=REFERENCE, linewidth=2.2, alpha=0.7, label="recorded"
+        )
         above.plot(t, factor * difference.replayed[:, axis], color=ACTUAL, linewidth=0.8, label="replayed")
         above.set_title(f"{name} ({unit})")
         error = factor * (difference.replayed[:, axis] - difference.recorded[:, axis])

@@ -12,13 +12,13 @@ from bridge.endpoint import VEHICLE, Endpoint
 from bridge.link import Link, open_link
 from bridge.process import StopFlag
 from controller.laws import make_law
-from fwav_hil.children import Child
 from fwav_hil.replay.difference import Difference
+from fwav_hil.replay.other_end import other_end
 from fwav_hil.replay.recorded import Recorded, Tick
 from plant_emulator.pacing import RESEND_AFTER_S
 from plant_emulator.process import FAREWELLS, meet_controller
 from protocol import mavlink_map
-from protocol.errors import FwavHilError, PeerLostError, UsageError
+from protocol.errors import PeerLostError, UsageError
 from protocol.messages import ActuatorCommand
 
 _LINK = "udpin://127.0.0.1:0"
@@ -59,21 +59,15 @@ def replay_into_process(run: Recorded, wait_s: float, stop: StopFlag) -> Differe
         clock = "lockstep" if run.lockstep else "realtime"
         address = link.uri.partition("://")[2]
         arguments = [str(scenario), "--clock", clock, "--wait", str(wait_s), "--link", f"udpout://{address}", "--arm"]
-        child = Child("controller", arguments)
-        try:
-            return compare_commands(run, _ask(run, link, wait_s, stop))
-        except FwavHilError:
-            child.end()
-            if child.process.stderr and not child.process.stderr.closed:
-                child.error += child.process.stderr.read().decode(errors="replace")
-            raise
-        finally:
-            child.ask_to_end()
-            child.end()
+        with other_end("controller", arguments, stop) as (_, watch):
+            return compare_commands(run, ask_controller(run, link, wait_s, watch))
 
 
-def _ask(run: Recorded, link: Link, wait_s: float, stop: StopFlag) -> dict[int, bytes]:
-    """Be the emulator that was recorded; returns the payload of each command by the time of its sample."""
+def ask_controller(run: Recorded, link: Link, wait_s: float, stop: StopFlag) -> dict[int, bytes]:
+    """Be the emulator that was recorded; returns the payload of each command by the time of its sample (ns).
+
+    Raises PeerError, LinkError and Interrupted.
+    """
     endpoint = Endpoint(link, VEHICLE[0], run.scenario.wire.emulator_component)
     meet_controller(run.scenario, wait_s, endpoint, stop)
     answers: dict[int, bytes] = {}

@@ -14,10 +14,11 @@ from bridge.memory import memory_pair
 from bridge.process import StopFlag, open_patiently
 from fwav_hil.children import Child, listen
 from fwav_hil.replay.difference import Difference
+from fwav_hil.replay.other_end import other_end
 from fwav_hil.replay.recorded import Recorded, Tick
 from plant_emulator.emulator import Emulator
 from protocol import mavlink_map
-from protocol.errors import FwavHilError, PeerLostError, PeerMissingError
+from protocol.errors import PeerLostError, PeerMissingError
 from protocol.mavlink_codec import FrameReader
 from protocol.messages import FloatArray
 
@@ -68,14 +69,11 @@ def replay_into_process(run: Recorded, wait_s: float, stop: StopFlag) -> Differe
         scenario.write_text(run.scenario.to_toml(), encoding="utf-8")
         arguments = [str(scenario), "--wait", str(wait_s), "--link", "udpin://127.0.0.1:0"]
         arguments += ["--duration", repr(len(run.ticks) * run.scenario.period_ns * 1e-9)]
-        child = Child("plant_emulator", arguments)
-        try:
-            address = _address(child)
-            with open_patiently(f"udpout://{address}", wait_s, stop) as link:
-                return compare_motion(run, _answer_all(run, link, wait_s, stop))
-        finally:
-            child.ask_to_end()
-            child.end()
+        with (
+            other_end("plant_emulator", arguments, stop) as (child, watch),
+            open_patiently(f"udpout://{_address(child)}", wait_s, watch) as link,
+        ):
+            return compare_motion(run, answer_emulator(run, link, wait_s, watch))
 
 
 def _address(child: Child) -> str:
@@ -86,8 +84,11 @@ def _address(child: Child) -> str:
     raise PeerMissingError(child.failure or "the emulator ended before it opened its link")
 
 
-def _answer_all(run: Recorded, link: Link, wait_s: float, stop: StopFlag) -> dict[int, bytes]:
-    """Be the controller that was recorded; returns the datagram of each tick by its time."""
+def answer_emulator(run: Recorded, link: Link, wait_s: float, stop: StopFlag) -> dict[int, bytes]:
+    """Be the controller that was recorded; returns the datagram of each tick by its time (ns).
+
+    Raises PeerError, LinkError and Interrupted.
+    """
     endpoint = Endpoint(link, *VEHICLE)
     reader = FrameReader(is_datagram=True)
     answers = {tick.t_ns: tick.answer for tick in run.ticks}
@@ -104,15 +105,17 @@ def _answer_all(run: Recorded, link: Link, wait_s: float, stop: StopFlag) -> dic
         data = link.recv(_HELLO_PERIOD_S)
         waits = 0 if data else waits + 1
         if waits * _HELLO_PERIOD_S > (_SILENCE_S if sent else wait_s):
-            raise PeerLostError("the emulator fell silent during the replay: see whether the scenario is that of the log")
+            raise PeerLostError(
+                "the emulator fell silent during the replay: see whether the scenario is that of the log"
+            )
         for frame in reader.read(data or b""):
             if frame.message_id == mavlink_map.HEARTBEAT.message_id and mavlink_map.heartbeat_is_ending(frame.payload):
                 return sent
             if frame.message_id == mavlink_map.TICK.message_id and data:
                 t_ns = mavlink_map.decode_tick_time_ns(frame.payload)
                 sent[t_ns] = data
-                if t_ns not in answers:
-                    raise FwavHilError(f"the log holds no command for t = {t_ns * 1e-9:.3f} s: it is shorter than the run")
+                if not answers.get(t_ns):
+                    raise PeerLostError(f"the log holds no command for t = {t_ns * 1e-9:.3f} s: replay it with --fast")
                 link.send(answers[t_ns])
 
 

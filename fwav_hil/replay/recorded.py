@@ -51,7 +51,7 @@ def recorded_run(log: Path, scenario_name: str | None, law: str | None) -> Recor
     scenario = _scenario_of(path, scenario_name)
     clock = read_sidecar(path).get("clock") or read_json(path.parent / "emulator.json").get("clock") or "lockstep"
     ticks = _ticks(scan, (VEHICLE[0], scenario.wire.emulator_component))
-    commands = {}
+    commands: dict[int, bytes] = {}
     for tick in ticks:
         for _, frame in tick.answers:
             if frame.message_id == mavlink_map.COMMAND.message_id:
@@ -70,7 +70,9 @@ def _scenario_of(log: Path, name: str | None) -> Scenario:
         return load_scenario(find_scenario(name))
     beside = log.parent / "scenario.toml"
     if not beside.exists():
-        raise UsageError(f"there is no scenario.toml beside {log}: name the scenario that it was flown with by --scenario")
+        raise UsageError(
+            f"there is no scenario.toml beside {log}: name the scenario that it was flown with by --scenario"
+        )
     return load_scenario(beside)
 
 
