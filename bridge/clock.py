@@ -8,6 +8,10 @@ from __future__ import annotations
 import abc
 import time
 
+LEAST_EARLY_NS = 100_000
+MOST_EARLY_NS = 20_000_000
+"""Bounds of how long before its moment a `PunctualClock` wakes."""
+
 
 class Clock(abc.ABC):
     """Tells the time and waits for it."""
@@ -33,6 +37,28 @@ class MonotonicClock(Clock):
         remaining_ns = t_ns - time.monotonic_ns()
         if remaining_ns > 0:
             time.sleep(remaining_ns * 1e-9)
+
+
+class PunctualClock(MonotonicClock):
+    """The machine's clock for those who must be on time: it wakes early and polls for the rest.
+
+    How early follows from how late the machine's sleeps have lately been: some 100 us on a quiet machine, up to 20 ms on a
+    shared virtual one, where frames that come that densely then keep a core busy.
+    """
+
+    def __init__(self) -> None:
+        self._early_ns = LEAST_EARLY_NS
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        """Sleep, then poll; returns within some microseconds of t_ns where the machine runs this process at all."""
+        wake_ns = t_ns - self._early_ns
+        if wake_ns > time.monotonic_ns():
+            super().sleep_until_ns(wake_ns)
+            late_ns = time.monotonic_ns() - wake_ns
+            slowly_less_ns = self._early_ns - self._early_ns // 256
+            self._early_ns = min(MOST_EARLY_NS, max(LEAST_EARLY_NS, slowly_less_ns, 4 * late_ns))
+        while time.monotonic_ns() < t_ns:
+            pass
 
 
 class VirtualClock(Clock):

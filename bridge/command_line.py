@@ -50,6 +50,10 @@ wait_option = click.option(
     "--wait", "wait_s", type=click.FloatRange(min=0.1), default=30.0, show_default=True, metavar="S",
     help="How long to wait for the other end to appear.",
 )  # fmt: skip
+log_error_option = click.option(
+    "--on-log-error", type=click.Choice(["stop", "continue"]), default="stop", show_default=True,
+    help="Where the disk is full or cannot be written: end with what was recorded, or go on without a complete log.",
+)  # fmt: skip
 json_option = click.option(
     "--json", "json_path", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
     help="Write the result as JSON to this file as well ('-': standard output; the table then goes to standard error).",
@@ -111,6 +115,8 @@ def _report_text(event: dict[str, Any]) -> None:
         click.echo(f"waiting on {event['link']}", err=True)
     elif kind == "started":
         click.echo(f"started with {event['peer']}", err=True)
+    elif kind == "warning":
+        click.echo(event["text"], err=True)
     elif kind == "progress" and sys.stderr.isatty():
         click.echo(f"\rt = {event['t_ns'] * 1e-9:7.2f} s", nl=False, err=True)
     elif kind == "ended":

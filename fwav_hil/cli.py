@@ -20,6 +20,7 @@ from bridge.command_line import (
     json_option,
     law_option,
     legs_option,
+    log_error_option,
     options,
     rate_option,
     scenario_argument,
@@ -39,6 +40,12 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "paper": ("fwav_hil.studies.paper_command:paper_command", "Run the source paper's section IV again."),
         "margin": ("fwav_hil.studies.margin_command:margin_command", "Say whether the gains stand the link."),
         "design": ("fwav_hil.studies.design_command:design_command", "Search gains for a link."),
+        "record": ("fwav_hil.record_command:record_command", "Record what comes over a live link, sending nothing."),
+        "replay": (
+            "fwav_hil.replay.command:replay_command",
+            "Replay a log: to a link, into a controller, into the plant.",
+        ),
+        "diff": ("fwav_hil.replay.diff_command:diff_command", "Compare two logs, sample by sample."),
         "report": ("fwav_hil.cli:report_command", "Score and plot a run folder again."),
     }
 )
@@ -111,6 +118,7 @@ plots_option = click.option("--plots/--no-plots", default=True, show_default=Tru
     legs_option,
     wait_option,
     out_option,
+    log_error_option,
     plots_option,
     json_option,
 )  # fmt: skip
@@ -127,6 +135,7 @@ def run_command(
     legs: bool,
     wait_s: float,
     out: Path | None,
+    on_log_error: str,
     plots: bool,
     json_path: Path | None,
 ) -> None:
@@ -148,11 +157,10 @@ def run_command(
     compile_kernels(chosen)
     folder = new_folder(chosen, out)
     try:
-        run(
-            chosen,
-            folder,
-            RunOptions(clock=clock, link=link, speed=speed, wait_s=wait_s, delay_ns=delay_ns, legs=legs),
+        run_options = RunOptions(
+            clock=clock, link=link, speed=speed, wait_s=wait_s, delay_ns=delay_ns, legs=legs, on_log_error=on_log_error
         )
+        run(chosen, folder, run_options)
     except FwavHilError:
         # The run's own error is the one to end with, whatever else its folder gives trouble with.
         with contextlib.suppress(FwavHilError):

@@ -62,3 +62,30 @@ class Progress:
     ) -> None:
         if self._bar:
             self._bar.stop()
+
+
+class StatusLine:
+    """One line of text on standard error: rewritten in place on a terminal, every two seconds elsewhere."""
+
+    def __init__(self) -> None:
+        self._clock = MonotonicClock()
+        self._line_ns = self._clock.now_ns()
+        self._in_place = sys.stderr.isatty()
+        self._width = 0
+
+    def show(self, text: str) -> None:
+        """Show how things stand; call it some times a second."""
+        if self._in_place:
+            sys.stderr.write("\r" + text.ljust(self._width))
+            self._width = len(text)
+        elif self._clock.now_ns() - self._line_ns > _LINE_PERIOD_NS:
+            self._line_ns = self._clock.now_ns()
+            sys.stderr.write(text + "\n")
+        sys.stderr.flush()
+
+    def end(self) -> None:
+        """Leave the line, so that what follows begins on one of its own."""
+        if self._in_place and self._width:
+            sys.stderr.write("\n")
+            sys.stderr.flush()
+        self._width = 0

@@ -1,6 +1,6 @@
 """The results of a run: from its folder to summary.json, plots and a table; it can be done again at any time.
 
-scenario.toml      the scenario in full           run.tlog            every frame, both directions
+scenario.toml      the scenario in full           run.tlog            every frame, both directions; run.tlog.json: its sidecar
 ground_truth.npy   one row a tick                 emulator.json, controller.json   counters of each end
 summary.json       scores, latency, counters      *.png               plots
 """
@@ -21,6 +21,7 @@ from protocol.scenario import NANOSECONDS, Scenario, load_scenario
 
 FILES = {
     "log": "run.tlog",
+    "sidecar": "run.tlog.json",
     "ground_truth": "ground_truth.npy",
     "scenario": "scenario.toml",
     "emulator": "emulator.json",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,7 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     show_progress: bool = True
     delay_ns: int = 0
     legs: bool = False
+    on_log_error: str = "stop"
 
 
 class RunFailedError(FwavHilError):
@@ -133,7 +135,8 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
         own += ["--delay", f"{options.delay_ns}ns"]
     if options.legs:
         common.append("--legs")
-    emulator = Child("plant_emulator", [*common, *placement.emulator, "--link", f"{scheme}://{address}", *own])
+    flight = ["--link", f"{scheme}://{address}", *own, "--on-log-error", options.on_log_error]
+    emulator = Child("plant_emulator", [*common, *placement.emulator, *flight])
     # The controller learns its link when the emulator has opened its own: were the port another run's, it must not go there.
     controller = Child("controller", [*common, *placement.controller, "--link", "-", "--arm"])
     try:
@@ -164,6 +167,8 @@ def _watch(scenario: Scenario, emulator: Child, controller: Child, stop: StopFla
                 told = True
                 scheme, _, address = event["link"].partition("://")
                 controller.tell(f"{_IN_TO_OUT[scheme]}://{address}")
+            elif kind == "warning":
+                sys.stderr.write(event["text"] + "\n")
             elif progress and child is emulator and kind == "progress":
                 progress.update(event["t_ns"] / NANOSECONDS, _error_now(scenario, event["t_ns"], event["q"]))
             if stop.requested or any(one.process.poll() for one in (emulator, controller)):

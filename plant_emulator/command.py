@@ -15,6 +15,7 @@ from bridge.command_line import (
     duration_option,
     json_option,
     legs_option,
+    log_error_option,
     options,
     process_options,
     rate_option,
@@ -53,6 +54,7 @@ Example:
         "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
         help="Folder for the log, the ground truth and the counters.",
     ),
+    log_error_option,
     json_option,
     process_options,
 )  # fmt: skip
@@ -68,6 +70,7 @@ def emulator(
     legs: bool,
     wait_s: float,
     out: Path | None,
+    on_log_error: str,
     json_path: Path | None,
     status: str,
     core: int | None,
@@ -80,7 +83,15 @@ def emulator(
     from plant_emulator.process import EmulatorOptions, run_emulator
 
     run_options = EmulatorOptions(
-        link=link, clock=clock, speed=speed, out=out, wait_s=wait_s, spin_s=spin_us * 1e-6, delay_ns=delay_ns, legs=legs
+        link=link,
+        clock=clock,
+        speed=speed,
+        out=out,
+        wait_s=wait_s,
+        spin_s=spin_us * 1e-6,
+        delay_ns=delay_ns,
+        legs=legs,
+        on_log_error=on_log_error,
     )
     summary = run_emulator(chosen, run_options, report, stop)
     show_json(json_path, {"scenario": chosen.name, "rate_hz": chosen.rate_hz, "seed": chosen.seed, **summary})

@@ -16,6 +16,8 @@ from bridge.link import Link
 from bridge.memory import memory_pair
 from bridge.process import Report, StopFlag, open_patiently
 from bridge.rate import RateKeeper
+from bridge.recorder import Recorder
+from bridge.sidecar import LinkOfLog
 from bridge.summary import make_folder, percentiles_us, refuse_existing_run, write_json, write_text
 from plant_emulator.emulator import Emulator
 from plant_emulator.pacing import Lockstep, Pacing, RealTime
@@ -38,6 +40,7 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     speed: lockstep paced to that multiple of real time (None: as fast as it goes). spin_s: see `Link.spin_s`.
     delay_ns: real time: what comes is taken so much later. legs: real time: note when each tick and command was where.
+    on_log_error: what a disk that refuses means for the run: "stop", or "continue" with what can be recorded.
     """
 
     link: str
@@ -48,6 +51,7 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     spin_s: float = 0.0
     delay_ns: int = 0
     legs: bool = False
+    on_log_error: str = "stop"
 
 
 def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
@@ -77,20 +81,52 @@ def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report
     try:
         if options.out:
             refuse_existing_run(options.out)
-            make_folder(options.out)
-            write_text(options.out / "scenario.toml", scenario.to_toml())
-            log, truth = TlogWriter(options.out / "run.tlog"), TruthWriter(options.out / "ground_truth.npy")
+            log, truth = _open_files(scenario, link, options, options.out, report)
         endpoint = Endpoint(link, VEHICLE[0], scenario.wire.emulator_component)
         emulator = Emulator(scenario, endpoint, truth)
         pacing = _pacing(scenario, options, emulator, endpoint, log, MonotonicClock(), stop)
         report({"event": "waiting", "link": link.uri})
-        _meet_controller(scenario, options, endpoint, stop)
+        meet_controller(scenario, options.wait_s, endpoint, stop)
         report({"event": "started", "peer": link.peer})
         if options.legs and isinstance(pacing, RealTime):
             pacing.legs = LegTable(TICK_COLUMNS), LegTable(ANSWER_COLUMNS)
         return _run_ticks(scenario, emulator, pacing, options.out, report)
     finally:
         _close_files(log, truth)
+
+
+def _open_files(
+    scenario: Scenario, link: Link, options: EmulatorOptions, out: Path, report: Report
+) -> tuple[TlogWriter | None, TruthWriter | None]:
+    """Begin the log and the ground truth of a run; None each where the disk refuses and the user chose to go on."""
+
+    def tell(sentence: str) -> None:
+        report({"event": "warning", "text": f"{sentence}; the run goes on"})
+
+    goes_on = options.on_log_error == "continue"
+    source = {
+        "scenario": scenario.name,
+        "law": scenario.law,
+        "seed": scenario.seed,
+        "rate_hz": scenario.rate_hz,
+        "duration_s": scenario.duration_s,
+        "digest": scenario.digest().hex(),
+        "clock": options.clock,
+    }
+    links = (LinkOfLog(link.uri, sent_by=((VEHICLE[0], scenario.wire.emulator_component),)),)
+    stamps = "simulation time" if options.clock == "lockstep" else "Unix time"
+    log = truth = None
+    try:
+        make_folder(out)
+        write_text(out / "scenario.toml", scenario.to_toml())
+        truth = TruthWriter(out / "ground_truth.npy", tell=tell if goes_on else None)
+        log = Recorder(out / "run.tlog", links, stamps=stamps, source=source, tell=tell if goes_on else None)
+    except RunFolderError as error:
+        if not goes_on:
+            _close_files(log, truth)
+            raise
+        tell(str(error))
+    return log, truth
 
 
 def warm_up(scenario: Scenario) -> None:
@@ -124,12 +160,12 @@ def _pacing(
     )  # fmt: skip
 
 
-def _meet_controller(scenario: Scenario, options: EmulatorOptions, endpoint: Endpoint, stop: StopFlag) -> None:
-    """Hold the plant at t = 0 until a controller with the same scenario says it is armed."""
+def meet_controller(scenario: Scenario, wait_s: float, endpoint: Endpoint, stop: StopFlag) -> None:
+    """Hold the plant at t = 0 until a controller with the same scenario says it is armed. Raises PeerError, Interrupted."""
     digest = scenario.digest()
     agreed = heard = False
     clock = MonotonicClock()
-    give_up_ns = clock.now_ns() + round(options.wait_s * NANOSECONDS)
+    give_up_ns = clock.now_ns() + round(wait_s * NANOSECONDS)
     due = Due(1.0 / HELLO_PERIOD_S)
     while (now_ns := clock.now_ns()) < give_up_ns:
         stop.check()
@@ -158,10 +194,10 @@ def _meet_controller(scenario: Scenario, options: EmulatorOptions, endpoint: End
     uri = endpoint.link.uri
     if heard:
         raise PeerMissingError(
-            f"the controller at {endpoint.link.peer} did not arm within {options.wait_s:g} s: start it with --arm"
+            f"the controller at {endpoint.link.peer} did not arm within {wait_s:g} s: start it with --arm"
         )
     raise PeerMissingError(
-        f"no controller came to {uri} within {options.wait_s:g} s: start one with `fwav-hil controller "
+        f"no controller came to {uri} within {wait_s:g} s: start one with `fwav-hil controller "
         f"SCENARIO --link {uri.replace('in://', 'out://', 1)}`, or wait longer with --wait"
     )
 
@@ -192,15 +228,19 @@ def _run_ticks(
         error = stopped
     wall_ns = clock.now_ns() - begun_ns
     _say_farewell(emulator, pacing, done * period_ns)
+    counters = {**emulator.all_counters(), **pacing.counters}
     summary = {
         "clock": "realtime" if isinstance(pacing, RealTime) else "lockstep",
         "ticks": done,
         "wall_s": wall_ns / NANOSECONDS,
         "latency_us": percentiles_us(pacing.latencies_ns),
         "tick_us": percentiles_us(ticks_ns),
-        "counters": {**emulator.all_counters(), **pacing.counters},
+        "counters": counters,
         "error": str(error) if error else None,
     }
+    if isinstance(pacing.log, Recorder):
+        pacing.log.sidecar["counters"] = counters
+        pacing.log.sidecar["links"][0]["peer"] = pacing.endpoint.link.peer
     if out:
         write_json(out / "emulator.json", summary)
         if isinstance(pacing, RealTime) and pacing.legs:

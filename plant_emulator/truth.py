@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 
@@ -31,10 +32,16 @@ _BLOCK = 1024
 
 
 class TruthWriter:
-    """Appends rows; the file's header is rewritten at each flush, so the file is whole up to the last one."""
+    """Appends rows; the file's header is rewritten at each flush, so the file is whole up to the last one.
 
-    def __init__(self, path: Path) -> None:
+    Where the disk refuses, RunFolderError is raised; with `tell`, that hears of it once instead, and rows are left out from
+    there on (`lost`): a file with a hole in its time would not be what it says it is.
+    """
+
+    def __init__(self, path: Path, tell: Callable[[str], None] | None = None) -> None:
         self.path = path
+        self.lost = 0
+        self._tell = tell
         self._block = np.zeros(_BLOCK, dtype=ROW)
         self._numbers: FloatArray = self._block.view("<f8").reshape(_BLOCK, -1)
         self._times = self._block["t_ns"]
@@ -62,6 +69,9 @@ class TruthWriter:
         """Write what is pending and make the header say so."""
         if not self._pending:
             return
+        if self.lost:
+            self._leave_out()
+            return
         try:
             self._file.seek(len(_header(0)) + self._count * ROW.itemsize)  # a failed flush may have left a part behind
             self._write(self._block[: self._pending].tobytes())
@@ -70,7 +80,15 @@ class TruthWriter:
             self._file.seek(0)
             self._write(_header(self._count))
         except OSError as error:
-            raise RunFolderError(f"cannot write the ground truth {self.path}: {error.strerror}") from None
+            sentence = f"cannot write the ground truth {self.path}: {error.strerror}"
+            if self._tell is None:
+                raise RunFolderError(sentence) from None
+            self._leave_out()
+            self._tell(sentence)
+
+    def _leave_out(self) -> None:
+        self.lost += self._pending
+        self._pending = 0
 
     def _write(self, data: bytes) -> None:
         """Write all of it: one unbuffered write may stop short, as on a disk that is nearly full."""

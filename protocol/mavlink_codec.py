@@ -20,6 +20,7 @@ from pymavlink.dialects.v20 import common
 MAGIC_V2 = 0xFD
 MAGIC_V1 = 0xFE
 HEADER_V2 = 10
+HEADER_V1 = 6
 CRC_SIZE = 2
 SIGNATURE_SIZE = 13
 SIGNED = 0x01
@@ -141,6 +142,10 @@ class FrameWriter:
         return _MAGIC + body + checksum.to_bytes(CRC_SIZE, "little")
 
 
+def _frame_of_mavlink1(raw: bytes) -> Frame:
+    return Frame(raw[5], raw[2], raw[3], raw[4], raw[HEADER_V1:-CRC_SIZE], raw)
+
+
 CAUSES = (
     "bad_crc",
     "garbage_bytes",
@@ -165,11 +170,13 @@ class FrameReader:
                sequence_gaps    frames lost, by the numbers of those that came
                out_of_order     frames that came again, or late
 
-    With follow_sequence False the last two count from the first call of `restart_sequences` on.
+    With follow_sequence False the last two count from the first call of `restart_sequences` on. With keep_mavlink1 True
+    MAVLink 1 frames of known messages are handed on too (for recorders), besides being counted.
     """
 
-    def __init__(self, *, is_datagram: bool, follow_sequence: bool = True) -> None:
+    def __init__(self, *, is_datagram: bool, follow_sequence: bool = True, keep_mavlink1: bool = False) -> None:
         self._is_datagram = is_datagram
+        self._keep_mavlink1 = keep_mavlink1
         self._follow_sequence = follow_sequence
         self._rest = b""
         self._next: dict[tuple[int, int], int] = {}
@@ -190,6 +197,15 @@ class FrameReader:
         at, end = 0, len(data)
         while at < end:
             if data[at] != MAGIC_V2:
+                if self._keep_mavlink1 and data[at] == MAGIC_V1:
+                    if not self._is_datagram and (at + 2 > end or at + HEADER_V1 + data[at + 1] + CRC_SIZE > end):
+                        self._rest = data[at:]
+                        break
+                    before, start = self.counters["mavlink1"], at
+                    at = self._skip_garbage(data, at)
+                    if self.counters["mavlink1"] > before:
+                        frames.append(_frame_of_mavlink1(data[start:at]))
+                    continue
                 at = self._skip_garbage(data, at)
                 continue
             size = self.frame_size(data, at)
@@ -255,8 +271,8 @@ class FrameReader:
 
     def _skip_garbage(self, data: bytes, at: int) -> int:
         """Where the next frame may begin; MAVLink 1 frames are told from garbage by their checksum."""
-        if data[at] == MAGIC_V1 and at + 8 <= len(data):
-            stop = at + 6 + data[at + 1]
+        if data[at] == MAGIC_V1 and at + HEADER_V1 + CRC_SIZE <= len(data):
+            stop = at + HEADER_V1 + data[at + 1]
             message = self._layouts.get(data[at + 5])
             if message and stop + CRC_SIZE <= len(data):
                 crc = _crc(data[at + 1 : stop] + message.crc_seed)

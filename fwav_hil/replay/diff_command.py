@@ -1,0 +1,86 @@
+"""The command line of `fwav-hil diff`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from bridge.command_line import json_option, options
+from bridge.summary import is_stdout, show_json
+
+if TYPE_CHECKING:
+    from fwav_hil.replay.diff import LogDifference
+
+EXAMPLE = """
+\b
+Example:
+  fwav-hil diff runs/before runs/after
+  fwav-hil diff a.tlog b.tlog --types ATT_POS_MOCAP --tolerance q=1e-6 --tolerance HIL_SENSOR.xacc=0.01 --tolerance 1e-5
+"""
+_SHOWN_ROWS = 30
+
+
+@click.command("diff", epilog=EXAMPLE)
+@options(
+    click.argument("first", type=click.Path(exists=True, path_type=Path)),
+    click.argument("second", type=click.Path(exists=True, path_type=Path)),
+    click.option(
+        "--tolerance", "tolerances", multiple=True, metavar="[FIELD=]VALUE",
+        help="What a field (FIELD, or MESSAGE.FIELD) may differ by; without FIELD, all others. Default: 0.",
+    ),
+    click.option("--types", multiple=True, metavar="NAME,...", help="Compare only these messages."),
+    json_option,
+)  # fmt: skip
+def diff_command(
+    first: Path, second: Path, tolerances: tuple[str, ...], types: tuple[str, ...], json_path: Path | None
+) -> int:
+    """Compare two logs (or run folders): rows are paired by the sample time that their messages carry.
+
+    \b
+    Exit codes: 0 the same within the tolerances, 1 different; others as ever.
+    """
+    from fwav_hil.replay.command import DIFFERENT
+    from fwav_hil.replay.diff import compare_logs, parse_tolerances
+    from fwav_hil.replay.selection import Choice, choose, open_log, split_names
+
+    allowed = parse_tolerances(tolerances)
+    names = tuple(name.upper() for name in split_names(types))
+    scans = open_log(first), open_log(second)
+    if names:
+        for scan in scans:
+            choose(scan, Choice(types=names))  # says so where a log has none of them
+    difference = compare_logs(*scans, allowed, names or None)
+    _print(difference, to_stderr=is_stdout(json_path))
+    show_json(json_path, {"first": str(scans[0].path), "second": str(scans[1].path), **difference.as_dict()})
+    return 0 if difference.is_same else DIFFERENT
+
+
+def _print(difference: LogDifference, *, to_stderr: bool) -> None:
+    """The fields beyond their tolerances, in the order in which they part, and what has no partner."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr)
+    beyond = sorted((f for f in difference.fields if f.beyond), key=lambda f: (f.first_s or 0.0, f.message, f.field))
+    if beyond:
+        table = Table("field", "sender")
+        for column in ("pairs", "beyond", "largest", "RMS", "first (s)"):
+            table.add_column(column, justify="right")
+        for f in beyond[:_SHOWN_ROWS]:
+            numbers = (str(f.pairs), str(f.beyond), f"{f.largest:.3g}", f"{f.rms:.3g}", f"{f.first_s:.3f}")
+            table.add_row(f"{f.message}.{f.field}", f.sender, *numbers)
+        console.print(table)
+        if len(beyond) > _SHOWN_ROWS:
+            console.print(f"and {len(beyond) - _SHOWN_ROWS} fields more (--json holds all)")
+    for name, rows in (("first", difference.only_first), ("second", difference.only_second)):
+        for what, count in rows.items():
+            console.print(f"only in the {name}: {count} of {what}")
+    changed = sum(1 for f in difference.fields if f.changed)
+    pairs = sum(f.pairs for f in difference.fields)
+    if difference.is_same:
+        words = "identical" if not changed else f"the same within the tolerances ({changed} fields differ by less)"
+        console.print(f"{words}: {len(difference.fields)} fields, {pairs} values compared")
+    else:
+        console.print(f"different: {len(beyond)} of {len(difference.fields)} fields")

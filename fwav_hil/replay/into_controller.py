@@ -1,0 +1,119 @@
+"""The recorded samples given to a controller once more, and its commands set beside the recorded ones."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from bridge.endpoint import VEHICLE, Endpoint
+from bridge.link import Link, open_link
+from bridge.process import StopFlag
+from controller.laws import make_law
+from fwav_hil.replay.difference import Difference
+from fwav_hil.replay.other_end import other_end
+from fwav_hil.replay.recorded import Recorded, Tick
+from plant_emulator.pacing import RESEND_AFTER_S
+from plant_emulator.process import FAREWELLS, meet_controller
+from protocol import mavlink_map
+from protocol.errors import PeerLostError, UsageError
+from protocol.messages import ActuatorCommand
+
+_LINK = "udpin://127.0.0.1:0"
+
+
+def replay_in_process(run: Recorded) -> Difference:
+    """Step the law of the run's scenario over its samples, in this process. Raises UsageError for state feedback."""
+    law = make_law(run.scenario.law, run.scenario)
+    if law.needs_velocity:
+        raise UsageError(law.velocity_sentence())
+    state, was_armed = law.start(), False
+    answers: dict[int, bytes] = {}
+    for tick in run.ticks:
+        sample = mavlink_map.decode_pose(tick.pose)
+        if sample is None or sample.t_ns != tick.t_ns or tick.t_ns in answers:
+            continue  # as the controller does: no pose, no sample; a tick sent again is answered as before
+        recorded = run.commands.get(tick.t_ns)
+        armed = recorded is None or bool(recorded[mavlink_map.COMMAND_MODE] & mavlink_map.ARMED)
+        if not (armed and was_armed):
+            law.restart(state)
+        was_armed = armed
+        command = ActuatorCommand(sample.t_ns, law.step(state, sample.t_ns, sample.q), armed)
+        answers[tick.t_ns] = mavlink_map.encode_command(command, law.output.scale, lockstep=run.lockstep)
+    return compare_commands(run, answers)
+
+
+def replay_into_process(run: Recorded, wait_s: float, stop: StopFlag) -> Difference:
+    """Start a controller process and give it the samples over a link, one for each answer.
+
+    Raises UsageError for state feedback, LinkError, PeerError and Interrupted.
+    """
+    law = make_law(run.scenario.law, run.scenario)
+    if law.needs_velocity:
+        raise UsageError(law.velocity_sentence())
+    with tempfile.TemporaryDirectory(prefix="fwav-hil-replay-") as folder, open_link(_LINK) as link:
+        scenario = Path(folder) / "scenario.toml"
+        scenario.write_text(run.scenario.to_toml(), encoding="utf-8")
+        clock = "lockstep" if run.lockstep else "realtime"
+        address = link.uri.partition("://")[2]
+        arguments = [str(scenario), "--clock", clock, "--wait", str(wait_s), "--link", f"udpout://{address}", "--arm"]
+        with other_end("controller", arguments, stop) as (_, watch):
+            return compare_commands(run, ask_controller(run, link, wait_s, watch))
+
+
+def ask_controller(run: Recorded, link: Link, wait_s: float, stop: StopFlag) -> dict[int, bytes]:
+    """Be the emulator that was recorded; returns the payload of each command by the time of its sample (ns).
+
+    Raises PeerError, LinkError and Interrupted.
+    """
+    endpoint = Endpoint(link, VEHICLE[0], run.scenario.wire.emulator_component)
+    meet_controller(run.scenario, wait_s, endpoint, stop)
+    answers: dict[int, bytes] = {}
+    for tick in run.ticks:
+        stop.check()
+        if tick.t_ns not in answers:
+            answers[tick.t_ns] = _answer(endpoint, tick)
+    farewell = mavlink_map.encode_emulator_heartbeat(ending=True)
+    for _ in range(FAREWELLS):
+        endpoint.send([endpoint.seal(mavlink_map.HEARTBEAT, farewell)])
+    return answers
+
+
+def _answer(endpoint: Endpoint, tick: Tick) -> bytes:
+    for wait_s in RESEND_AFTER_S:
+        endpoint.link.send(tick.datagram)
+        while frames := endpoint.receive(wait_s):
+            for frame in frames:
+                payload = frame.payload.ljust(mavlink_map.COMMAND.size, b"\0")
+                if (
+                    frame.message_id == mavlink_map.COMMAND.message_id
+                    and int.from_bytes(payload[:8], "little") * 1000 == tick.t_ns
+                ):
+                    return payload
+    raise PeerLostError(
+        f"the controller gave no answer to the recorded sample at t = {tick.t_ns * 1e-9:.3f} s for 2 s: "
+        "see whether the scenario is the one of the log"
+    )
+
+
+def compare_commands(run: Recorded, answers: Mapping[int, bytes]) -> Difference:
+    """The recorded commands and those of a replay, by the time of their sample: every byte of the payload counts."""
+    both = sorted(run.commands.keys() & answers.keys())
+    scale = np.array(run.scenario.actuators.scale)
+    size = mavlink_map.COMMAND.size
+
+    def tau(payloads: list[bytes]) -> np.typing.NDArray[np.float64]:
+        table = np.frombuffer(b"".join(payloads), dtype=mavlink_map.COMMAND.dtype)
+        return table["controls"][:, :6].astype(float) * scale if len(table) else np.empty((0, 6))
+
+    recorded, replayed = [run.commands[t] for t in both], [answers[t].ljust(size, b"\0") for t in both]
+    return Difference(
+        "command",
+        np.array(both, dtype=np.int64),
+        tau(recorded),
+        tau(replayed),
+        np.array([a == b for a, b in zip(recorded, replayed, strict=True)], dtype=np.bool_),
+        len(run.commands.keys() ^ answers.keys()),
+    )

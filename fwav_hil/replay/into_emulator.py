@@ -1,0 +1,145 @@
+"""The recorded commands given to the plant once more, and its motion set beside the recorded one."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from bridge.endpoint import VEHICLE, Endpoint
+from bridge.link import Link
+from bridge.memory import memory_pair
+from bridge.process import StopFlag, open_patiently
+from fwav_hil.children import Child, listen
+from fwav_hil.replay.difference import Difference
+from fwav_hil.replay.other_end import other_end
+from fwav_hil.replay.recorded import Recorded, Tick
+from plant_emulator.emulator import Emulator
+from protocol import mavlink_map
+from protocol.errors import PeerLostError, PeerMissingError
+from protocol.mavlink_codec import FrameReader
+from protocol.messages import FloatArray
+
+_SILENCE_S = 3.0
+_HELLO_PERIOD_S = 0.1
+
+
+def replay_in_process(run: Recorded) -> Difference:
+    """Fly the scenario's plant with the recorded commands, in this process. Raises DivergenceError.
+
+    Of a lockstep log each command acts as it did. In real time it acted when it arrived, which the log knows to a
+    microsecond: the motion is then near the recorded one, and not the same.
+    """
+    near, far = memory_pair()
+    with near, far:
+        endpoint = Endpoint(near, VEHICLE[0], run.scenario.wire.emulator_component)
+        emulator = Emulator(run.scenario, endpoint, None)
+        period_ns, newest_ns = run.scenario.period_ns, -1
+        sent: dict[int, bytes] = {}
+        for number, tick in enumerate(run.ticks):
+            t_ns = number * period_ns
+            sent[t_ns] = b"".join(emulator.sense(t_ns))
+            for stamp_us, frame in tick.answers:
+                if frame.message_id != mavlink_map.COMMAND.message_id:
+                    continue
+                command = emulator.decode(frame.payload)
+                if command is None or command.t_ns <= newest_ns:
+                    continue
+                newest_ns = command.t_ns
+                if run.lockstep:
+                    emulator.act(t_ns, run.scenario.delay_ns, command)
+                else:
+                    since_tick_ns = min(max(0, 1000 * (stamp_us - tick.stamp_us)), period_ns)
+                    emulator.act(t_ns + since_tick_ns, 0, command)
+            if not run.lockstep:
+                emulator.check_staleness(t_ns + period_ns)
+            emulator.advance(t_ns + period_ns)
+    return compare_motion(run, sent)
+
+
+def replay_into_process(run: Recorded, wait_s: float, stop: StopFlag) -> Difference:
+    """Start an emulator process and answer each of its ticks with what was recorded for it.
+
+    Raises LinkError, PeerError and Interrupted.
+    """
+    with tempfile.TemporaryDirectory(prefix="fwav-hil-replay-") as folder:
+        scenario = Path(folder) / "scenario.toml"
+        scenario.write_text(run.scenario.to_toml(), encoding="utf-8")
+        arguments = [str(scenario), "--wait", str(wait_s), "--link", "udpin://127.0.0.1:0"]
+        arguments += ["--duration", repr(len(run.ticks) * run.scenario.period_ns * 1e-9)]
+        with (
+            other_end("plant_emulator", arguments, stop) as (child, watch),
+            open_patiently(f"udpout://{_address(child)}", wait_s, watch) as link,
+        ):
+            return compare_motion(run, answer_emulator(run, link, wait_s, watch))
+
+
+def _address(child: Child) -> str:
+    for _, event in listen([child]):
+        if event.get("event") == "waiting":
+            return str(event["link"]).partition("://")[2]
+    child.end()
+    raise PeerMissingError(child.failure or "the emulator ended before it opened its link")
+
+
+def answer_emulator(run: Recorded, link: Link, wait_s: float, stop: StopFlag) -> dict[int, bytes]:
+    """Be the controller that was recorded; returns the datagram of each tick by its time (ns).
+
+    Raises PeerError, LinkError and Interrupted.
+    """
+    endpoint = Endpoint(link, *VEHICLE)
+    reader = FrameReader(is_datagram=True)
+    answers = {tick.t_ns: tick.answer for tick in run.ticks}
+    hello = [
+        (mavlink_map.HEARTBEAT, mavlink_map.encode_controller_heartbeat(armed=True)),
+        (mavlink_map.VERSION, mavlink_map.encode_version(run.scenario.digest())),
+    ]
+    sent: dict[int, bytes] = {}
+    waits = 0
+    while True:
+        stop.check()
+        if not sent:
+            endpoint.send([endpoint.seal(*said) for said in hello])
+        data = link.recv(_HELLO_PERIOD_S)
+        waits = 0 if data else waits + 1
+        if waits * _HELLO_PERIOD_S > (_SILENCE_S if sent else wait_s):
+            raise PeerLostError(
+                "the emulator fell silent during the replay: see whether the scenario is that of the log"
+            )
+        for frame in reader.read(data or b""):
+            if frame.message_id == mavlink_map.HEARTBEAT.message_id and mavlink_map.heartbeat_is_ending(frame.payload):
+                return sent
+            if frame.message_id == mavlink_map.TICK.message_id and data:
+                t_ns = mavlink_map.decode_tick_time_ns(frame.payload)
+                sent[t_ns] = data
+                if not answers.get(t_ns):
+                    raise PeerLostError(f"the log holds no command for t = {t_ns * 1e-9:.3f} s: replay it with --fast")
+                link.send(answers[t_ns])
+
+
+def compare_motion(run: Recorded, sent: Mapping[int, bytes]) -> Difference:
+    """The recorded ticks and those of a replay: every byte that the emulator sent counts; shown is the pose."""
+    recorded = {tick.t_ns: tick for tick in run.ticks}
+    both = sorted(recorded.keys() & sent.keys())
+    reader = FrameReader(is_datagram=True, follow_sequence=False)
+
+    def pose(payload: bytes) -> FloatArray:
+        sample = mavlink_map.decode_pose(payload)
+        return sample.q if sample else np.full(6, np.nan)
+
+    def pose_in(datagram: bytes) -> bytes:
+        return next(f.payload for f in reader.read(datagram) if f.message_id == mavlink_map.POSE.message_id)
+
+    def equal(tick: Tick) -> bool:
+        return tick.datagram == sent[tick.t_ns]
+
+    return Difference(
+        "motion",
+        np.array(both, dtype=np.int64),
+        np.array([pose(recorded[t].pose) for t in both]).reshape(-1, 6),
+        np.array([pose(pose_in(sent[t])) for t in both]).reshape(-1, 6),
+        np.array([equal(recorded[t]) for t in both], dtype=np.bool_),
+        len(recorded.keys() ^ sent.keys()),
+    )

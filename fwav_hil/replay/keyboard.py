@@ -1,0 +1,77 @@
+"""Keys pressed while a log plays: looked at without waiting, and only where standard input is a terminal of ours."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import termios
+import tty
+from collections.abc import Callable, Mapping
+from types import MappingProxyType, TracebackType
+
+from bridge.replay import Player
+
+SEEK_S = 5.0
+HELP = "space: hold, go on   n: one frame   left, right: 5 s back, ahead   up, down: 60 s   q: end"
+
+KEYS: Mapping[bytes, Callable[[Player], None]] = MappingProxyType(
+    {
+        b" ": Player.hold,
+        b"n": Player.step,
+        b"q": Player.stop,
+        b"\x1b[C": lambda player: player.seek(SEEK_S),
+        b"\x1b[D": lambda player: player.seek(-SEEK_S),
+        b"\x1b[A": lambda player: player.seek(12 * SEEK_S),
+        b"\x1b[B": lambda player: player.seek(-12 * SEEK_S),
+    }
+)
+
+
+class Keyboard:
+    """Acts on a player as keys are pressed. Ctrl-C stays what it is.
+
+    active   whether there is a terminal to read from, with this process in its foreground
+    """
+
+    def __init__(self) -> None:
+        self.active = False
+        self._file = -1
+        self._rest = b""
+        try:
+            self._file = sys.stdin.fileno()
+            self.active = os.isatty(self._file) and os.tcgetpgrp(self._file) == os.getpgrp()
+        except (OSError, ValueError, AttributeError):  # closed, replaced, or none
+            self.active = False
+
+    def attend(self, player: Player) -> None:
+        """Do what the keys pressed since the last call ask for."""
+        if not self.active or not select.select([self._file], [], [], 0)[0]:
+            return
+        data = self._rest + os.read(self._file, 256)
+        if not data:
+            self.active = False  # the terminal has gone
+            return
+        self._rest = b""
+        at = 0
+        while at < len(data):
+            size = 3 if data[at] == 0x1B else 1
+            key = data[at : at + size]
+            if len(key) < size:
+                self._rest = key  # the rest of an arrow key is still to come
+                return
+            if key in KEYS:
+                KEYS[key](player)
+            at += size
+
+    def __enter__(self) -> Keyboard:
+        if self.active:
+            self._before = termios.tcgetattr(self._file)
+            tty.setcbreak(self._file)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.active:
+            termios.tcsetattr(self._file, termios.TCSADRAIN, self._before)

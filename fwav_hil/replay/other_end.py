@@ -1,0 +1,38 @@
+"""The live other end of a replay: a process that is watched while it is talked to, and never left behind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from bridge.process import StopFlag
+from fwav_hil.children import Child
+from protocol.errors import PeerLostError
+
+
+class WatchingStop(StopFlag):
+    """A wish to stop that also looks whether the other end still runs."""
+
+    def __init__(self, stop: StopFlag, child: Child) -> None:
+        super().__init__()
+        self._stop = stop
+        self._child = child
+
+    def check(self) -> None:
+        """Raise Interrupted where a stop was requested, PeerLostError where the process has failed."""
+        self._stop.check()
+        if self._child.process.poll():
+            if self._child.process.stderr:
+                self._child.error += self._child.process.stderr.read().decode(errors="replace")
+            raise PeerLostError(self._child.failure or f"the {self._child.module} process ended")
+
+
+@contextmanager
+def other_end(module: str, arguments: list[str], stop: StopFlag) -> Iterator[tuple[Child, WatchingStop]]:
+    """Start a process of the project for as long as the block lasts."""
+    child = Child(module, arguments)
+    try:
+        yield child, WatchingStop(stop, child)
+    finally:
+        child.ask_to_end()
+        child.end()

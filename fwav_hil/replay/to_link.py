@@ -1,0 +1,199 @@
+"""A log replayed to a link: true to time, or faster or slower, to whoever listens there."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn
+from rich.progress import Progress as Bar
+
+from bridge.clock import Clock, PunctualClock, unix_time_us
+from bridge.link import NOBODY, Link
+from bridge.process import StopFlag, open_patiently
+from bridge.replay import Player, log_times_ns
+from bridge.summary import percentiles_us
+from fwav_hil.progress import StatusLine
+from fwav_hil.replay.keyboard import HELP, Keyboard
+from fwav_hil.replay.selection import time_of_day
+from protocol.errors import Interrupted, PeerMissingError
+from protocol.log_scan import Scan
+from protocol.retime import Signer, TimeMover, read_key
+
+_DRAIN_LIMIT = 100
+
+
+class ReplayOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """How a log is replayed. speed: of log time; None is as fast as it goes."""
+
+    speed: float | None = 1.0
+    loop: bool = False
+    max_gap_s: float | None = None
+    rewrite_time: bool = False
+    signing_key: Path | None = None
+    wait_s: float = 30.0
+
+
+def replay_to(
+    scan: Scan, chosen: npt.NDArray[np.bool_], uri: str, options: ReplayOptions, stop: StopFlag
+) -> dict[str, Any]:
+    """Replay the chosen frames; returns what was sent, and how punctually. Raises LinkError, PeerError, Interrupted."""
+    key = read_key(options.signing_key) if options.signing_key else None
+    with open_patiently(uri, options.wait_s, stop) as link:
+        clock = PunctualClock()
+        _await_peer(link, options.wait_s, clock, stop)
+        return Replay(scan, chosen, link, options, clock, stop, key).run()
+
+
+def _await_peer(link: Link, wait_s: float, clock: Clock, stop: StopFlag) -> None:
+    """On a link that waits for its peer: wait until there is one."""
+    give_up_ns = clock.now_ns() + round(wait_s * 1e9)
+    told = False
+    while link.peer == NOBODY:
+        stop.check()
+        if clock.now_ns() > give_up_ns:
+            raise PeerMissingError(
+                f"nobody came to {link.uri} within {wait_s:g} s: start the receiver, or wait longer with --wait"
+            )
+        if not told:
+            told = True
+            sys.stderr.write(f"waiting on {link.uri}\n")
+        link.recv(0.1)
+
+
+class Replay:
+    """One log on its way to one link."""
+
+    def __init__(
+        self,
+        scan: Scan,
+        chosen: npt.NDArray[np.bool_],
+        link: Link,
+        options: ReplayOptions,
+        clock: Clock,
+        stop: StopFlag,
+        key: bytes | None = None,
+    ) -> None:
+        self._scan = scan
+        self._data = scan.data.tobytes()
+        self._begins: list[int] = scan.frames["offset"][chosen].tolist()
+        self._ends: list[int] = scan.ends()[chosen].tolist()
+        self._stamps_us = scan.frames["stamp_us"][chosen]
+        self._link = link
+        self._options = options
+        self._clock = clock
+        self._stop = stop
+        self._mover = TimeMover(scan, chosen, unix_time_us()) if options.rewrite_time else None
+        self._signer = Signer(key) if key else None
+        self._were_signed = int(np.count_nonzero(scan.frames["signed"][chosen]))
+        times_ns = log_times_ns(self._stamps_us, options.max_gap_s)
+        self._pass_us = int(times_ns[-1]) // 1000 + 1
+        self.player = Player(times_ns, self._prepare, link.send, clock, speed=options.speed, look=self._attend)
+        self._keyboard = Keyboard()
+        self._display = _Display(len(self._begins))
+
+    def run(self) -> dict[str, Any]:
+        """Play it. Raises Interrupted where the user stopped it, PeerMissingError where nobody took anything."""
+        begun_ns = self._clock.now_ns()
+        with self._keyboard, self._display:
+            if self._keyboard.active:
+                self._display.say(HELP)
+            if self._were_signed and not self._signer:
+                self._display.say(
+                    f"{self._were_signed} frames carry the signatures of their day, which a receiver that checks them "
+                    "refuses: sign anew with --signing-key FILE"
+                )
+            self.player.play(loop=self._options.loop)
+            self._attend(self.player)
+        result = self._result(self._clock.now_ns() - begun_ns)
+        if self._stop.requested:
+            raise Interrupted(f"interrupted after {result['frames']} frames")
+        stats = self._link.stats
+        if stats.refused + stats.send_failed > result["frames"] // 2:
+            raise PeerMissingError(
+                f"nobody listens at {self._link.uri} ({stats.refused + stats.send_failed} of {result['frames']} frames "
+                "were refused): start the receiver first, or correct the address"
+            )
+        return result
+
+    def _prepare(self, number: int, passes: int) -> bytes:
+        frame = self._data[self._begins[number] : self._ends[number]]
+        if self._mover:
+            frame = self._mover.move(frame, passes * self._pass_us)
+        return self._signer.sign(frame, unix_time_us()) if self._signer else frame
+
+    def _attend(self, player: Player) -> None:
+        """Look after all but the frames: the wish to stop, keys, what the receiver says, the display."""
+        if self._stop.requested:
+            player.stop()
+            return
+        self._keyboard.attend(player)
+        for _ in range(_DRAIN_LIMIT):
+            if not self._link.recv(0.0):
+                break
+        self._display.show(player, self._stamps_us)
+
+    def _result(self, wall_ns: int) -> dict[str, Any]:
+        player, span_s = self.player, int(self.player.times_ns[-1]) * 1e-9
+        log_s = player.passes * span_s + (player.log_ns * 1e-9 if player.at < len(self._begins) else 0.0)
+        return {
+            "log": str(self._scan.path),
+            "to": self._link.uri,
+            "frames": player.sent,
+            "passes": player.passes,
+            "log_s": log_s,
+            "wall_s": wall_ns * 1e-9,
+            "speed": self._options.speed,
+            "speed_measured": log_s / (wall_ns * 1e-9) if wall_ns else None,
+            "lateness_us": percentiles_us(player.lateness_ns),
+            "counters": {
+                "times_moved": self._mover.moved if self._mover else 0,
+                "signed": self._signer.signed if self._signer else 0,
+                "not_signed": self._signer.unsigned if self._signer else 0,
+                **self._link.stats.as_dict(),
+            },
+        }
+
+
+class _Display:
+    """Log time in a bar on a terminal, a line now and then elsewhere."""
+
+    def __init__(self, frames: int) -> None:
+        self._frames = frames
+        self._line = StatusLine()
+        self._bar: Bar | None = None
+        if sys.stderr.isatty():
+            columns = (TextColumn("replaying"), BarColumn(bar_width=30), TextColumn("{task.description}"))
+            self._bar = Bar(*columns, console=Console(stderr=True))
+            self._task = self._bar.add_task("", total=frames)
+
+    def say(self, text: str) -> None:
+        (self._bar.console.print if self._bar else _print)(text)
+
+    def show(self, player: Player, stamps_us: npt.NDArray[np.int64]) -> None:
+        at = min(player.at, self._frames - 1)
+        text = f"log time {time_of_day(int(stamps_us[at]))}, {player.sent} frames sent" + (
+            ", held" if player.held else ""
+        )
+        if self._bar:
+            self._bar.update(self._task, completed=player.at, description=text)
+        else:
+            self._line.show(text)
+
+    def __enter__(self) -> _Display:
+        if self._bar:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar:
+            self._bar.stop()
+
+
+def _print(text: str) -> None:
+    sys.stderr.write(text + "\n")
