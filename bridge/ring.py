@@ -42,7 +42,7 @@ class ByteRing:
         os.ftruncate(descriptor, HEADER_BYTES + capacity)
         return cls(descriptor, capacity)
 
-    def put(self, data: bytes) -> bool:
+    def put(self, data: bytes | bytearray) -> bool:
         """Put all of `data`, or nothing where it does not fit (False)."""
         words = self._words
         put, size = words[_PUT], len(data)

@@ -70,6 +70,7 @@ class Pacing(abc.ABC):
             for t_us, frames in self._owed:
                 for frame in frames:
                     write(t_us, frame)
+            self.log.hand_over()
         self._owed.clear()
 
     def flush(self) -> None:

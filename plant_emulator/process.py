@@ -16,7 +16,7 @@ from bridge.link import Link
 from bridge.memory import memory_pair
 from bridge.process import Report, StopFlag, open_patiently
 from bridge.rate import RateKeeper
-from bridge.recorder import Recorder
+from bridge.ring_recorder import RingRecorder
 from bridge.sidecar import LinkOfLog
 from bridge.summary import make_folder, percentiles_us, refuse_existing_run, write_json, write_text
 from plant_emulator.emulator import Emulator
@@ -113,14 +113,17 @@ def _open_files(
         "digest": scenario.digest().hex(),
         "clock": options.clock,
     }
-    links = (LinkOfLog(link.uri, sent_by=((VEHICLE[0], scenario.wire.emulator_component),)),)
-    stamps = "simulation time" if options.clock == "lockstep" else "Unix time"
+    recorded = LinkOfLog(link.uri, sent_by=((VEHICLE[0], scenario.wire.emulator_component),))
+    lockstep = options.clock == "lockstep"
+    stamps = "simulation time" if lockstep else "Unix time"
     log = truth = None
     try:
         make_folder(out)
         write_text(out / "scenario.toml", scenario.to_toml())
         truth = TruthWriter(out / "ground_truth.npy", tell=tell if goes_on else None)
-        log = Recorder(out / "run.tlog", links, stamps=stamps, source=source, tell=tell if goes_on else None)
+        log = RingRecorder(
+            out / "run.tlog", recorded, stamps=stamps, source=source, may_wait=lockstep, tell=tell if goes_on else None
+        )
     except RunFolderError as error:
         if not goes_on:
             _close_files(log, truth)
@@ -238,7 +241,7 @@ def _run_ticks(
         "counters": counters,
         "error": str(error) if error else None,
     }
-    if isinstance(pacing.log, Recorder):
+    if isinstance(pacing.log, RingRecorder):
         pacing.log.sidecar["counters"] = counters
         pacing.log.sidecar["links"][0]["peer"] = pacing.endpoint.link.peer
     if out:

@@ -33,10 +33,16 @@ class TlogWriter:
 
     def write(self, t_us: int, frame: bytes) -> None:
         """Log one frame."""
-        self._pending += _STAMP.pack(t_us)
-        self._pending += frame
+        self._append(t_us, frame)
         if len(self._pending) >= _FLUSH_BYTES:
             self.flush()
+
+    def _append(self, t_us: int, frame: bytes) -> None:
+        self._pending += _STAMP.pack(t_us)
+        self._pending += frame
+
+    def hand_over(self) -> None:
+        """Let go of what was written so far, where somebody else writes it to disk; here it waits for `flush`."""
 
     def flush(self) -> None:
         """Hand what is pending to the system."""
