@@ -162,6 +162,8 @@ def budget_line(scenario: Scenario, clock: str = "lockstep") -> Budget:
         delay_s = scenario.delay_ns / NANOSECONDS
         samples = f"{scenario.delay.samples} sample{'s' if scenario.delay.samples != 1 else ''}"
         taken = f"this link takes {_ms(delay_s)} ({samples} at {scenario.rate_hz:g} Hz + {_ms(scenario.delay.seconds)})"
+        if delay_s == 0.0:
+            taken = "this link takes none of it"
     head = f"delay budget ({scenario.law}, {scenario.rate_hz:g} Hz): "
     if not bounded:
         return Budget(

@@ -173,6 +173,11 @@ class TestBudget:
         assert ("less than a third" in budget.sentence) == (warn and delay_s < 0.024)
         assert ("too much: unstable" in budget.sentence) == (delay_s > 0.0242)
 
+    def test_of_a_scenario_without_delay(self) -> None:
+        budget = budget_line(scenario_of("paper"))
+        assert (budget.delay_s, budget.left_s) == (0.0, budget.max_delay_s)
+        assert "this link takes none of it, 5.84 ms left" in budget.sentence
+
     def test_in_real_time_the_link_is_the_delay(self) -> None:
         budget = budget_line(scenario_of("flapper"), "realtime")
         assert budget.delay_s == pytest.approx(0.004)
