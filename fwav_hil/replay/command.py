@@ -76,6 +76,7 @@ def _speed(_context: click.Context, _option: click.Parameter, text: str) -> floa
         "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
         help="Folder for the report of a difference; by default a new one in runs/ (--into).",
     ),
+    click.option("--plots/--no-plots", default=True, show_default=True, help="Draw a difference (PNG; --into)."),
     wait_option,
     json_option,
 )  # fmt: skip
@@ -95,6 +96,7 @@ def replay_command(
     scenario: str | None,
     fast: bool,
     out: Path | None,
+    plots: bool,
     wait_s: float,
     json_path: Path | None,
 ) -> int:
@@ -113,7 +115,7 @@ def replay_command(
         )
     if into:
         return _replay_into(
-            log, into, law=law, scenario=scenario, fast=fast, out=out, wait_s=wait_s, json_path=json_path
+            log, into, law=law, scenario=scenario, fast=fast, out=out, plots=plots, wait_s=wait_s, json_path=json_path
         )
     from bridge.process import StopFlag
     from fwav_hil.replay.selection import Choice, choose, open_log, split_names
@@ -146,6 +148,7 @@ def _replay_into(
     scenario: str | None,
     fast: bool,
     out: Path | None,
+    plots: bool,
     wait_s: float,
     json_path: Path | None,
 ) -> int:
@@ -172,7 +175,8 @@ def _replay_into(
     print_difference(difference, title, to_stderr=is_stdout(json_path))
     if not difference.is_zero and len(difference.t_ns):
         folder = _report_folder(out, f"replay-{run.scenario.name}-{run.scenario.law}")
-        plot_difference(difference, title, folder / "difference.png")
+        if plots:
+            plot_difference(difference, title, folder / "difference.png")
         write_json(folder / "difference.json", result)
         click.echo(f"report: {folder}", err=is_stdout(json_path))
     show_json(json_path, result)
@@ -184,7 +188,7 @@ def _report_folder(out: Path | None, name: str) -> Path:
     from bridge.summary import make_folder
 
     folder = out or Path("runs") / f"{name}-{local_stamp()}"
-    if (folder / "difference.png").exists():
+    if (folder / "difference.json").exists():
         raise RunFolderError(f"{folder} holds a report already, which stays: choose another folder with --out")
     make_folder(folder)
     return folder

@@ -17,9 +17,9 @@ HELP = "space: hold, go on   n: one frame   left, right: 5 s back, ahead   up, d
 
 KEYS: Mapping[bytes, Callable[[Player], None]] = MappingProxyType(
     {
-        b" ": Player.hold,
-        b"n": Player.step,
-        b"q": Player.stop,
+        b" ": lambda player: player.hold(),
+        b"n": lambda player: player.step(),
+        b"q": lambda player: player.stop(),
         b"\x1b[C": lambda player: player.seek(SEEK_S),
         b"\x1b[D": lambda player: player.seek(-SEEK_S),
         b"\x1b[A": lambda player: player.seek(12 * SEEK_S),

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.clock import MonotonicClock, VirtualClock, local_stamp, unix_time_us
+from bridge.clock import MonotonicClock, PunctualClock, VirtualClock, local_stamp, unix_time_us
 
 
 class TestMonotonicClock:
@@ -80,3 +80,43 @@ def test_a_stamp_is_a_date_a_time_and_a_name_that_any_file_system_takes() -> Non
     time.strptime(stamp, "%Y-%m-%dT%H-%M-%S")
     assert len(stamp) == len("2026-11-22T14-05-09")
     assert set(stamp) <= set("0123456789-T")
+
+
+class TestPunctualClock:
+    def test_it_is_on_time_and_never_early(self) -> None:
+        clock = PunctualClock()
+        for wait_ns in (-1, 0, 50_000, 300_000, 3_000_000):
+            deadline_ns = clock.now_ns() + wait_ns
+            clock.sleep_until_ns(deadline_ns)
+            assert clock.now_ns() >= deadline_ns
+
+    def test_the_later_the_machine_wakes_it_the_earlier_it_wakes(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        now_ns, overslept_ns = 0, 0
+
+        def sleep(wait_s: float) -> None:
+            nonlocal now_ns
+            now_ns += round(wait_s * 1e9) + overslept_ns
+
+        def read() -> int:
+            nonlocal now_ns
+            now_ns += 20_000  # a look at the clock takes its time
+            return now_ns
+
+        monkeypatch.setattr(time, "sleep", sleep)
+        monkeypatch.setattr(time, "monotonic_ns", read)
+        clock = PunctualClock()
+
+        def lateness_ns() -> int:
+            deadline_ns = now_ns + 50_000_000
+            clock.sleep_until_ns(deadline_ns)
+            return now_ns - deadline_ns
+
+        assert lateness_ns() <= 40_000
+        overslept_ns = 3_000_000
+        assert lateness_ns() > 2_000_000
+        assert lateness_ns() <= 40_000
+        overslept_ns = 0
+        for _ in range(1200):
+            lateness_ns()
+        overslept_ns = 3_000_000
+        assert lateness_ns() > 2_000_000, "it has come to trust the machine again"

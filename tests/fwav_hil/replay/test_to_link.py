@@ -1,0 +1,250 @@
+"""Logs replayed to a link: what arrives, with what times and signatures, and what goes wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common
+
+from bridge.clock import VirtualClock
+from bridge.memory import memory_pair
+from bridge.process import StopFlag
+from fwav_hil.replay.keyboard import Keyboard
+from fwav_hil.replay.selection import Choice, choose, open_log
+from fwav_hil.replay.to_link import Replay, ReplayOptions
+from protocol import mavlink_map
+from protocol.mavlink_codec import FrameReader
+from protocol.tlog import read_tlog
+from tests.fwav_hil.replay.conftest import Command
+
+KEY = bytes(range(32))
+
+
+@pytest.fixture
+def listener() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
+        opened.bind(("127.0.0.1", 0))
+        opened.settimeout(0.5)
+        yield opened
+
+
+def uri_of(listener: socket.socket) -> str:
+    return f"udpout://127.0.0.1:{listener.getsockname()[1]}"
+
+
+def received(listener: socket.socket) -> list[bytes]:
+    datagrams = []
+    try:
+        while True:
+            datagrams.append(listener.recv(2048))
+    except TimeoutError:
+        return datagrams
+
+
+def frames_of(folder: Path) -> list[bytes]:
+    return [frame.raw for _, frame in read_tlog(folder / "run.tlog")]
+
+
+class TestOverALink:
+    def test_every_frame_arrives_as_it_was(
+        self, fwav_hil: Command, run_folder: Path, listener: socket.socket, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert fwav_hil("replay", run_folder, "--to", uri_of(listener), "--json", "-") == 0
+        assert received(listener) == frames_of(run_folder)
+        result = json.loads(capsys.readouterr().out)
+        assert result["frames"] == len(frames_of(run_folder))
+        assert result["log_s"] == pytest.approx(0.4)
+        assert result["wall_s"] >= 0.4
+        assert result["lateness_us"]["p50"] is not None
+
+    def test_a_part_of_it_as_fast_as_it_goes(
+        self, fwav_hil: Command, run_folder: Path, listener: socket.socket
+    ) -> None:
+        options = ("--from", "0.1", "--to", "0.2", "--types", "HIL_SENSOR,att_pos_mocap", "--system", "1/191")
+        assert fwav_hil("replay", run_folder, "--to", uri_of(listener), "--speed", "max", *options) == 0
+        frames = [frame for data in received(listener) for frame in FrameReader(is_datagram=True).read(data)]
+        ticks = [frame for frame in frames if frame.message_id == mavlink_map.TICK.message_id]
+        assert len(frames) == 2 * len(ticks) == 52
+        times_ns = [mavlink_map.decode_tick_time_ns(frame.payload) for frame in ticks]
+        assert (times_ns[0], times_ns[-1]) == (100_000_000, 200_000_000)
+
+    def test_signed_anew_pymavlink_believes_it(
+        self, fwav_hil: Command, run_folder: Path, listener: socket.socket, tmp_path: Path
+    ) -> None:
+        (tmp_path / "key").write_text(KEY.hex())
+        options = ("--speed", "max", "--signing-key", tmp_path / "key", "--rewrite-time")
+        assert fwav_hil("replay", run_folder, "--to", uri_of(listener), *options) == 0
+        reader = common.MAVLink(None)
+        reader.signing.secret_key = KEY
+        messages = [reader.parse_char(data) for data in received(listener)]
+        assert len(messages) == len(frames_of(run_folder))
+        assert all(message.get_type() != "BAD_DATA" for message in messages)
+
+    def test_one_who_comes_to_a_waiting_port_gets_it(self, fwav_hil: Command, run_folder: Path) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as chooser:
+            port = chooser.getsockname()[1]
+        arrived = bytearray()
+
+        def come() -> None:
+            for _ in range(200):
+                with socket.socket() as client:
+                    if client.connect_ex(("127.0.0.1", port)) == 0:
+                        while data := client.recv(65536):
+                            arrived.extend(data)
+                        return
+                threading.Event().wait(0.02)
+
+        thread = threading.Thread(target=come)
+        thread.start()
+        assert fwav_hil("replay", run_folder, "--to", f"tcpin://127.0.0.1:{port}", "--speed", "max") == 0
+        thread.join()
+        assert bytes(arrived) == b"".join(frames_of(run_folder))
+
+
+class TestTrouble:
+    def test_nobody_listening_is_told(
+        self, fwav_hil: Command, run_folder: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+            taken.bind(("127.0.0.1", 0))
+            port = taken.getsockname()[1]
+        assert fwav_hil("replay", run_folder, "--to", f"udpout://127.0.0.1:{port}", "--speed", "100") == 4
+        assert "nobody listens at udpout://" in capsys.readouterr().err
+
+    @pytest.mark.parametrize("target", ["udpin://127.0.0.1:0", "tcpin://127.0.0.1:0"])
+    def test_nobody_coming_is_told(
+        self, fwav_hil: Command, run_folder: Path, target: str, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert fwav_hil("replay", run_folder, "--to", target, "--wait", "0.1") == 4
+        assert "nobody came to" in capsys.readouterr().err
+
+    def test_a_taken_port_is_told(
+        self, fwav_hil: Command, run_folder: Path, listener: socket.socket, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        port = listener.getsockname()[1]
+        assert fwav_hil("replay", run_folder, "--to", f"udpin://127.0.0.1:{port}") == 3
+        assert f"port {port} on 127.0.0.1 is taken" in capsys.readouterr().err
+
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            ((), "say where to replay once"),
+            (("--to", "udpout://127.0.0.1:9", "--into", "controller"), "say where to replay once"),
+            (("--to", "udpout://127.0.0.1:9", "--to", "udpout://127.0.0.1:8"), "say where to replay once"),
+            (("--to", "udpout://127.0.0.1:9", "--speed", "0.05"), "0.05 is no speed"),
+            (("--to", "udpout://127.0.0.1:9", "--speed", "fast"), "fast is no speed"),
+            (("--to", "udpout://127.0.0.1:9", "--from", "noon"), "--from noon is no time"),
+            (("--to", "udpout://127.0.0.1:9", "--from", "99"), "no frame of"),
+            (("--to", "carrier://pigeon"), "names no link"),
+            (("--to", "udpout://127.0.0.1:9", "--signing-key", "nowhere"), "cannot read the signing key nowhere"),
+        ],
+    )
+    def test_a_wrong_argument_is_one_sentence(
+        self,
+        fwav_hil: Command,
+        run_folder: Path,
+        arguments: tuple[str, ...],
+        words: str,
+        capsys: pytest.CaptureFixture[str],
+    ) -> None:
+        assert fwav_hil("replay", run_folder, *arguments) == 2
+        said = capsys.readouterr().err.strip()
+        assert words in said
+        assert len(said.splitlines()) == 1
+
+    def test_a_stop_ends_it_between_two_frames(
+        self, fwav_hil: Command, run_folder: Path, listener: socket.socket, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+        assert fwav_hil("replay", run_folder, "--to", uri_of(listener), "--loop") == 130
+        assert "interrupted after" in capsys.readouterr().err
+        whole = set(frames_of(run_folder))
+        assert all(frame in whole for frame in received(listener))
+
+
+class TestLoop:
+    def test_with_times_rewritten_they_never_run_back(self, run_folder: Path) -> None:
+        scan = open_log(run_folder)
+        near, far = memory_pair()
+        stop, clock, times = StopFlag(), VirtualClock(), list[int]()
+        with near, far:
+            chosen = choose(scan, Choice(types=("HIL_SENSOR",)))
+            how = ReplayOptions(speed=10.0, loop=True, rewrite_time=True)
+            replay = Replay(scan, chosen, near, how, clock, stop)
+            play = replay.player.play
+
+            def stop_after_three(*, loop: bool) -> None:
+                replay.player._look = lambda player: player.stop() if player.passes == 3 else None
+                play(loop=loop)
+
+            replay.player.play = stop_after_three  # type: ignore[method-assign]
+            result = replay.run()
+            while data := far.recv(0.0):
+                times.append(mavlink_map.decode_tick_time_ns(data[10:-2]))
+        assert result["passes"] == 3
+        assert len(times) >= 300
+        assert (np.diff(times) > 0).all()
+        assert clock.now_ns() == pytest.approx(3 * 0.396e9 / 10, rel=0.02)
+
+
+class TestKeyboard:
+    @pytest.fixture
+    def terminal(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, Keyboard]]:
+        ours, theirs = pty.openpty()
+        with os.fdopen(theirs, "r") as file:
+            monkeypatch.setattr("sys.stdin", file)
+            monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp())
+            with Keyboard() as keyboard:
+                assert keyboard.active
+                yield ours, keyboard
+        os.close(ours)
+
+    def test_keys_do_what_the_help_says(self, terminal: tuple[int, Keyboard]) -> None:
+        ours, keyboard = terminal
+        player = _Player()
+        for keys, expected in (
+            (b" ", ["hold"]),
+            (b"nn", ["step", "step"]),
+            (b"\x1b[C\x1b[D", ["seek 5.0", "seek -5.0"]),
+            (b"\x1b[A", ["seek 60.0"]),
+            (b"x\x1b[Z ", ["hold"]),
+            (b"\x1b[", []),
+            (b"Bq", ["seek -60.0", "stop"]),
+        ):
+            os.write(ours, keys)
+            for _ in range(200):
+                keyboard.attend(player)  # type: ignore[arg-type]
+                if len(player.calls) >= len(expected):
+                    break
+                threading.Event().wait(0.005)
+            assert player.calls == expected
+            player.calls.clear()
+
+    def test_without_a_terminal_there_is_none(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        (tmp_path / "in").write_text("q")
+        with (tmp_path / "in").open() as file:
+            monkeypatch.setattr("sys.stdin", file)
+            with Keyboard() as keyboard:
+                assert not keyboard.active
+                player = _Player()
+                keyboard.attend(player)  # type: ignore[arg-type]
+                assert player.calls == []
+
+
+class _Player:
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *values: self.calls.append(" ".join([name, *map(str, values)]))
