@@ -13,6 +13,7 @@
      |   |- ScenarioMismatchError 4 holds another scenario
      |- DivergenceError         5   the plant left the region where its equations hold
      |- RunFolderError          6   the results cannot be written
+     |   |- LogError            6   a log cannot be read
      |- Interrupted           130   the user stopped it
 
 The message of each is one sentence that names the place and the remedy; the command line prints it as it is, without a
@@ -86,6 +87,10 @@ class RunFolderError(FwavHilError):
     """Results cannot be written where they should go."""
 
     exit_code = 6
+
+
+class LogError(RunFolderError):
+    """A log cannot be read, or is none."""
 
 
 class Interrupted(FwavHilError):

@@ -11,10 +11,12 @@ from pathlib import Path
 from types import TracebackType
 
 from protocol.errors import RunFolderError
-from protocol.mavlink_codec import Frame, FrameReader
+from protocol.log_scan import scan_tlog
+from protocol.mavlink_codec import Frame
 
 _STAMP = struct.Struct(">Q")
 _FLUSH_BYTES = 1 << 16
+_SIGNED = 0x01
 
 
 class TlogWriter:
@@ -63,21 +65,14 @@ class TlogWriter:
 def read_tlog(path: Path) -> Iterator[tuple[int, Frame]]:
     """(time in us, frame) of each record, in order; stops at a record that is cut short or damaged.
 
-    Raises RunFolderError where the file cannot be read.
+    The strict reading, for logs of this project; `log_scan.scan_tlog` goes on behind damage. Raises LogError where the
+    file cannot be read.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise RunFolderError(f"cannot read the log {path}: {error.strerror}") from None
-    reader = FrameReader(is_datagram=True)
+    scan = scan_tlog(path)
     at = 0
-    while at + _STAMP.size + 3 <= len(data):
-        (t_us,) = _STAMP.unpack_from(data, at)
-        start = at + _STAMP.size
-        size = reader.frame_size(data, start)
-        frames = reader.read(data[start : start + size])
-        # A damaged length may reach over the next record: what is then found in the middle is not this record's frame.
-        if len(frames) != 1 or len(frames[0].raw) != size:
+    for row, found in enumerate(scan.frames):
+        if found["offset"] != at + _STAMP.size or int(found["flags"]) & ~_SIGNED or not found["stamp_ok"]:
             return
-        yield t_us, frames[0]
-        at = start + size
+        identity = (int(found[name]) for name in ("message_id", "sequence", "system", "component"))
+        yield int(found["stamp_us"]), Frame(*identity, scan.payload(row), scan.raw(row))
+        at = int(found["offset"]) + int(found["length"])
