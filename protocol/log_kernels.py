@@ -43,10 +43,21 @@ KNOWN, LEARNED = 1 << 16, 1 << 25
 SIZE_SHIFT, LEARNED_SHIFT = 8, 17
 _OWN = KNOWN | 0xFFFF
 
-POSITION, SEARCH, COUNT, LAST_STAMP, RAW_STAMP, SIGNATURE, DAMAGED, CRC_FAILURES, RESYNCHRONISATIONS, CUT, LEARNT = (
-    range(11)
-)
-STATE_SIZE = 11
+(
+    POSITION,
+    SEARCH,
+    COUNT,
+    LAST_STAMP,
+    RAW_STAMP,
+    SIGNATURE,
+    DAMAGED,
+    CRC_FAILURES,
+    RESYNCHRONISATIONS,
+    CUT,
+    UNSTAMPED,
+    LEARNT,
+) = range(12)
+STATE_SIZE = 12
 
 _DAY_US = 86_400_000_000
 _SIMULATION_OR_DATE_US = 1 << 52  # the year 2112; simulation times begin at 0
@@ -265,7 +276,11 @@ def scan_slice(
         if state[SEARCH] < 0:
             at = floor + stamp_size
             verdict = checksum_verdict(data, at, table)
-            if verdict < 0:
+            if verdict <= 0 and stamp_size and checksum_verdict(data, floor, table) > 0:
+                # A record may hold several frames behind one stamp, as QGroundControl writes what it sends.
+                at = floor
+                verdict = checksum_verdict(data, at, table)
+            elif verdict < 0:
                 message = message_of(data, at)
                 fits = verdict > -257 and unknown_fits(data, at, table, state[LAST_STAMP], stamp_size)
                 if fits:
@@ -308,7 +323,8 @@ def scan_slice(
 def take(data: Bytes, at: int, verdict: int, stamp_size: int, state: State, frames: npt.NDArray[np.void]) -> None:
     """Write the row of the frame at `at`, and go on behind it."""
     floor = state[POSITION]
-    if at - stamp_size < floor and state[SIGNATURE] and state[COUNT]:
+    reaches_back = at - stamp_size < floor and near(stamp_at(data, at - stamp_size), state[LAST_STAMP])
+    if state[SIGNATURE] and (at < floor or (stamp_size and reaches_back)):
         # The frame before has its checksum but not the whole signature that it announced.
         last = frames[state[COUNT] - 1]
         whole = floor - state[SIGNATURE]
@@ -342,9 +358,12 @@ def take(data: Bytes, at: int, verdict: int, stamp_size: int, state: State, fram
     row["signed"] = signature > 0
     row["known"] = verdict == 1
     row["stamp_ok"] = stamp >= 0
-    if near(stamp, state[LAST_STAMP]) or (stamp >= 0 and near(stamp, state[RAW_STAMP]) and state[RAW_STAMP] >= 0):
-        state[LAST_STAMP] = stamp
-    state[RAW_STAMP] = stamp
+    if stamp_size and at == floor:
+        state[UNSTAMPED] += 1
+    else:
+        if near(stamp, state[LAST_STAMP]) or (state[RAW_STAMP] >= 0 and near(stamp, state[RAW_STAMP])):
+            state[LAST_STAMP] = stamp
+        state[RAW_STAMP] = stamp
     state[SIGNATURE] = signature
     state[POSITION] = end + signature
     state[COUNT] += 1

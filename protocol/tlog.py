@@ -73,6 +73,7 @@ def read_tlog(path: Path) -> Iterator[tuple[int, Frame]]:
     for row, found in enumerate(scan.frames):
         if found["offset"] != at + _STAMP.size or int(found["flags"]) & ~_SIGNED or not found["stamp_ok"]:
             return
-        identity = (int(found[name]) for name in ("message_id", "sequence", "system", "component"))
-        yield int(found["stamp_us"]), Frame(*identity, scan.payload(row), scan.raw(row))
+        message_id, sequence = int(found["message_id"]), int(found["sequence"])
+        sender = int(found["system"]), int(found["component"])
+        yield int(found["stamp_us"]), Frame(message_id, sequence, *sender, scan.payload(row), scan.raw(row))
         at = int(found["offset"]) + int(found["length"])
