@@ -38,6 +38,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "latency": ("fwav_hil.latency.command:latency", "Measure where the time goes in the loop or on a link."),
         "paper": ("fwav_hil.studies.paper_command:paper_command", "Run the source paper's section IV again."),
         "report": ("fwav_hil.cli:report_command", "Score and plot a run folder again."),
+        "log": ("fwav_hil.logs.command:log_group", "Read telemetry logs: info, dump, plot, export."),
     }
 )
 
