@@ -19,6 +19,9 @@ TELEMETRY, RAW = "MAVLink telemetry log", "raw MAVLink stream (no time stamps)"
 ARDUPILOT, PX4 = "ArduPilot dataflash log", "PX4 log"
 _CHUNK = 1 << 15
 
+Sender = tuple[int, int | None]
+"""A system and one component of it; None is all of them."""
+
 
 @dataclass(frozen=True)
 class Log:
@@ -50,14 +53,14 @@ class Log:
         names: Collection[str] | None = None,
         *,
         between_us: tuple[int, int] | None = None,
-        systems: Collection[int] | None = None,
+        senders: Collection[Sender] | None = None,
     ) -> Tables:
-        """The tables of those messages, times (both ends included) and systems; None is all.
+        """The tables of those messages, times (both ends included) and senders; None is all.
 
-        Logs that autopilots write themselves have no systems: there `systems` has no effect.
+        Logs that autopilots write of themselves name no systems: there `senders` has no effect.
         """
         if self.scan is not None:
-            return tables(self.scan, names, chosen_rows(self.scan, between_us, systems))
+            return tables(self.scan, names, chosen_rows(self.scan, between_us, senders))
         made = {name: table for name, table in self._tables.items() if names is None or name in names}
         if between_us is None:
             return made
@@ -66,16 +69,21 @@ class Log:
 
 
 def chosen_rows(
-    scan: Scan, between_us: tuple[int, int] | None, systems: Collection[int] | None
+    scan: Scan, between_us: tuple[int, int] | None, senders: Collection[Sender] | None
 ) -> npt.NDArray[np.bool_] | None:
     """A truth value for each row of a scan; None where all are chosen."""
-    if between_us is None and systems is None:
+    if between_us is None and senders is None:
         return None
     chosen = np.ones(len(scan), dtype=np.bool_)
     if between_us is not None:
         chosen &= (scan.frames["stamp_us"] >= between_us[0]) & (scan.frames["stamp_us"] <= between_us[1])
-    if systems is not None:
-        chosen &= np.isin(scan.frames["system"], list(systems))
+    if senders is not None:
+        wanted = np.zeros(len(scan), dtype=np.bool_)
+        for system, component in senders:
+            wanted |= (scan.frames["system"] == system) & (
+                (component is None) | (scan.frames["component"] == component)
+            )
+        chosen &= wanted
     return chosen
 
 
@@ -127,7 +135,7 @@ def messages(
     names: Collection[str] | None = None,
     *,
     between_us: tuple[int, int] | None = None,
-    systems: Collection[int] | None = None,
+    senders: Collection[Sender] | None = None,
     unknown: bool = True,
 ) -> Iterator[Message]:
     """Message by message: in the order of the file, or of time where the log is one that an autopilot wrote itself.
@@ -136,10 +144,10 @@ def messages(
     leaves it out.
     """
     if log.scan is None:
-        yield from _by_time(log.tables(names, between_us=between_us, systems=systems))
+        yield from _by_time(log.tables(names, between_us=between_us, senders=senders))
         return
     scan = log.scan
-    chosen = chosen_rows(scan, between_us, systems)
+    chosen = chosen_rows(scan, between_us, senders)
     for start in range(0, len(scan), _CHUNK):
         part = Scan(scan.path, scan.data, scan.frames[start : start + _CHUNK], scan.stamp_size, scan.counters)
         mask = None if chosen is None else chosen[start : start + _CHUNK]

@@ -13,10 +13,10 @@ from bridge.summary import is_stdout, show_json
 log_argument = click.argument("log", type=click.Path(path_type=Path))
 when_options = options(
     click.option(
-        "--system", "systems", multiple=True, type=click.IntRange(0, 255), metavar="N",
-        help="Messages of this system only; may be repeated.",
+        "--system", "systems", multiple=True, metavar="N[/C]",
+        help="Messages of this system, or of one component of it, only; may be repeated.",
     ),
-    click.option("--from", "start", metavar="TIME", help="From here on: seconds from the log's beginning, or HH:MM:SS."),
+    click.option("--from", "start", metavar="TIME", help="From here on: seconds since the log began, or HH:MM:SS (UTC)."),
     click.option("--to", "end", metavar="TIME", help="Up to here, as in --from."),
 )  # fmt: skip
 types_option = click.option(
@@ -53,7 +53,7 @@ def info_command(log: Path, json_path: Path | None) -> None:
     click.option("--json", "as_json", is_flag=True, help="One JSON object a line instead of text."),
 )
 def dump_command(
-    log: Path, types: tuple[str, ...], systems: tuple[int, ...], start: str | None, end: str | None, as_json: bool
+    log: Path, types: tuple[str, ...], systems: tuple[str, ...], start: str | None, end: str | None, as_json: bool
 ) -> None:
     """Print the messages of LOG, one a line, in their order."""
     from fwav_hil.logs.choice import choose, open_with_progress
@@ -62,7 +62,7 @@ def dump_command(
 
     opened = open_with_progress(log)
     choice = choose(opened, types, systems, start, end)
-    chosen = messages(opened, choice.names, between_us=choice.between_us, systems=choice.systems)
+    chosen = messages(opened, choice.names, between_us=choice.between_us, senders=choice.senders)
     lines = json_lines(chosen) if as_json else text_lines(chosen, opened.span_us()[0])
     sys.stdout.writelines(lines)
     sys.stdout.flush()
@@ -80,7 +80,7 @@ def plot_command(
     log: Path,
     fields: tuple[str, ...],
     out: Path | None,
-    systems: tuple[int, ...],
+    systems: tuple[str, ...],
     start: str | None,
     end: str | None,
 ) -> None:
@@ -110,7 +110,7 @@ def export_command(log: Path, kind: str, out: Path | None, json_path: Path | Non
     from fwav_hil.logs.choice import Choice, open_with_progress
     from fwav_hil.logs.export import default_output, export_log
 
-    result = export_log(open_with_progress(log), kind, out or default_output(log, kind), Choice(None, None, None))
+    result = export_log(open_with_progress(log), kind, out or default_output(log, kind), Choice())
     messages = sum(result["messages"].values())
     click.echo(f"{result['out']}: {messages} messages of {len(result['messages'])} kinds", err=is_stdout(json_path))
     show_json(json_path, result)

@@ -42,7 +42,7 @@ def export_log(log: Log, kind: str, out: Path, choice: Choice) -> dict[str, Any]
 
         with whole(out) as partial, Working(f"writing {out.name}") as working:
             return {"out": str(out), "files": [out.name], "messages": write_mcap(log, partial, choice, working)}
-    made = log.tables(choice.names, between_us=choice.between_us, systems=choice.systems)
+    made = log.tables(choice.names, between_us=choice.between_us, senders=choice.senders)
     write: Callable[[str, npt.NDArray[np.void], Path, Callable[[int], None]], None] = (
         _write_parquet if kind == "parquet" else _write_csv
     )

@@ -18,6 +18,7 @@ GAP = 3.0
 """An interval longer than this many times the usual (median) one is a gap."""
 
 PLACES_SHOWN = 20
+_YEAR_2000_S = 946_684_800.0
 
 
 def log_info(log: Log) -> dict[str, Any]:
@@ -124,6 +125,13 @@ def print_info(info: dict[str, Any], *, to_stderr: bool = False) -> None:
     if places:
         shown = ", ".join(f"{place['offset']} ({place['bytes']})" for place in places)
         console.print(f"at byte (bytes): {shown}" + (" ..." if len(places) == PLACES_SHOWN else ""))
+
+
+def _moment(t_s: float) -> str:
+    """A date where the stamps are dates, else the time that they count."""
+    if t_s < _YEAR_2000_S:
+        return f"t = {t_s:.6f} s"
+    return str(np.datetime64(round(1e3 * t_s), "ms")).replace("T", " ") + " UTC"
 
 
 def _systems_table(rows: list[dict[str, Any]]) -> Table:

@@ -24,7 +24,7 @@ _TELL_EVERY = 4096
 
 def write_mcap(log: Log, path: Path, choice: Choice, working: Working) -> dict[str, int]:
     """Write the chosen messages; returns how many of each. Unknown ones are left out: nothing says what is in them."""
-    made = log.tables(choice.names, between_us=choice.between_us, systems=choice.systems)
+    made = log.tables(choice.names, between_us=choice.between_us, senders=choice.senders)
     total = sum(map(len, made.values()))
     counts = dict.fromkeys(made, 0)
     encode = msgspec.json.Encoder().encode
@@ -37,7 +37,7 @@ def write_mcap(log: Log, path: Path, choice: Choice, working: Working) -> dict[s
         }
         del made
         channels: dict[str, int] = {}
-        chosen = messages(log, choice.names, between_us=choice.between_us, systems=choice.systems, unknown=False)
+        chosen = messages(log, choice.names, between_us=choice.between_us, senders=choice.senders, unknown=False)
         for number, message in enumerate(chosen):
             topic = topic_of(message)
             if topic not in channels:

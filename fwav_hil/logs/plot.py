@@ -42,7 +42,7 @@ def lines_of(log: Log, wanted: str, choice: Choice) -> list[Line]:
     held = log.names()
     if message not in held:
         raise UsageError(f"{log.path} holds no message {message}{near_matches(message, held)}")
-    table = log.tables([message], between_us=choice.between_us, systems=choice.systems).get(message)
+    table = log.tables([message], between_us=choice.between_us, senders=choice.senders).get(message)
     if table is None:
         raise UsageError(f"{log.path} holds no {message} of that time and system")
     if field not in (table.dtype.names or ()):
