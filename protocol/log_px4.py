@@ -29,9 +29,10 @@ def read_px4(path: Path) -> tuple[Tables, dict[str, int]]:
     """
     from pyulog import ULog
 
+    content = path.read_bytes()
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints what it thinks of damage
-            log = ULog(str(path))
+            log = ULog(io.BytesIO(content))  # not the path: it leaves files open
     except Exception as error:  # noqa: BLE001  (it raises whatever damaged definitions lead to)
         raise LogError(f"{path} is no PX4 log that can be read: {error}") from None
     made = {

@@ -17,7 +17,7 @@ def text_lines(messages: Iterable[Message], start_us: int) -> Iterator[str]:
     for message in messages:
         sender = f" {message.system}.{message.component}" if message.system is not None else ""
         fields = ", ".join(f"{name}={_shown(value)}" for name, value in message.fields.items())
-        yield f"{(message.t_us - start_us) * 1e-6:.6f}{sender} {message.name} {fields}\n"
+        yield f"{(message.t_us - start_us) / 1e6:.6f}{sender} {message.name} {fields}\n"
 
 
 def _shown(value: Any) -> str:
@@ -25,7 +25,9 @@ def _shown(value: Any) -> str:
         return f"{value:.{_DIGITS}g}"
     if isinstance(value, list):
         return "[" + ", ".join(map(_shown, value)) + "]"
-    return f'"{value}"' if isinstance(value, str) else str(value)
+    if isinstance(value, str):
+        return msgspec.json.encode(value).decode()  # whatever is in it, it stays one line
+    return str(value)
 
 
 def json_lines(messages: Iterable[Message]) -> Iterator[str]:

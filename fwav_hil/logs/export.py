@@ -128,7 +128,7 @@ def _write_csv(name: str, table: npt.NDArray[np.void], path: Path, told: Callabl
 
     writer = None
     for number, rows in enumerate(_chunks(table)):
-        columns: dict[str, npt.NDArray[Any]] = {"time_s": rows["t_us"] * 1e-6}
+        columns: dict[str, npt.NDArray[Any]] = {"time_s": rows["t_us"] / 1e6}
         columns |= {column: rows[column] for column in _head(table)}
         for field in fields_of(table):
             value = rows[field]

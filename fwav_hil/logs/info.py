@@ -30,12 +30,12 @@ def log_info(log: Log) -> dict[str, Any]:
     """
     first, last = log.span_us()
     count = len(log.scan) if log.scan is not None else sum(len(table) for table in log.tables().values())
-    duration_s = (last - first) * 1e-6
+    duration_s = (last - first) / 1e6
     return {
         "log": str(log.path),
         "kind": log.kind,
         "bytes": log.path.stat().st_size,
-        "start_s": first * 1e-6,
+        "start_s": first / 1e6,
         "duration_s": duration_s,
         "messages": count,
         "rate_hz": (count - 1) / duration_s if duration_s > 0 else None,
@@ -87,7 +87,7 @@ def _types_of_tables(log: Log) -> list[dict[str, Any]]:
 
 def _pace(stamps_us: npt.NDArray[np.int64]) -> dict[str, Any]:
     """Count, rate and gaps of records at these times."""
-    intervals = np.diff(stamps_us) * 1e-6
+    intervals = np.diff(stamps_us) / 1e6
     usual = float(np.median(intervals)) if len(intervals) else None
     span = float(intervals.sum())
     return {
@@ -114,7 +114,7 @@ def print_info(info: dict[str, Any], *, to_stderr: bool = False) -> None:
     rate = f", {info['rate_hz']:.0f} a second" if info["rate_hz"] else ""
     console.print(f"{info['log']}: {info['kind']}, {info['bytes']} bytes")
     console.print(
-        f"{info['messages']} messages in {info['duration_s']:.3f} s{rate}, from t = {info['start_s']:.6f} s on"
+        f"{info['messages']} messages in {info['duration_s']:.3f} s{rate}, from {_moment(info['start_s'])} on"
     )
     if info["systems"]:
         console.print(_systems_table(info["systems"]))

@@ -23,7 +23,10 @@ _FIELD = re.compile(r"(?P<message>\w+)\.(?P<field>\w+)(?:\[(?P<index>\d+)\])?$")
 
 
 class Line(NamedTuple):
-    """One line of a plot: times (s from the log's beginning) and values, both of shape (rows,)."""
+    """One line of a plot: times (s from the log's beginning) and values, both of shape (rows,).
+
+    `label` tells it from the other lines of its field: the element, and the sender where there are several.
+    """
 
     label: str
     t_s: npt.NDArray[np.float64]
@@ -47,7 +50,7 @@ def lines_of(log: Log, wanted: str, choice: Choice) -> list[Line]:
         raise UsageError(f"{log.path} holds no {message} of that time and system")
     if field not in (table.dtype.names or ()):
         raise UsageError(f"{message} has no field {field}{near_matches(field, fields_of(table))}")
-    column = table[field]
+    column, first_us = table[field], log.span_us()[0]
     if column.dtype.kind not in "iufb":
         raise UsageError(f"{wanted} is text, which has no plot; see `fwav-hil log dump {log.path} --types {message}`")
     if index is not None and (column.ndim == 1 or int(index) >= column.shape[1]):
@@ -57,9 +60,9 @@ def lines_of(log: Log, wanted: str, choice: Choice) -> list[Line]:
     if column.ndim > 1:
         elements = range(column.shape[1]) if index is None else [int(index)]
     return [
-        Line(f"{message}.{field}" + (f"[{element}]" if element is not None else "") + sender, times, values)
+        Line(" ".join(filter(None, (f"[{element}]" if element is not None else "", sender))), times, values)
         for sender, rows in _senders(table)
-        for times in [(table["t_us"][rows] - log.span_us()[0]) * 1e-6]
+        for times in [(table["t_us"][rows] - first_us) / 1e6]
         for element in elements[:MOST_LINES]
         for values in [(column[rows] if element is None else column[rows, element]).astype(np.float64)]
     ]
@@ -71,7 +74,7 @@ def _senders(table: npt.NDArray[np.void]) -> list[tuple[str, npt.NDArray[np.bool
         return [("", np.ones(len(table), dtype=np.bool_))]
     key = table["system"].astype(int) << 8 | table["component"]
     found = np.unique(key)
-    names = [f" ({number >> 8}.{number & 0xFF})" if len(found) > 1 else "" for number in found]
+    names = [f"{number >> 8}.{number & 0xFF}" if len(found) > 1 else "" for number in found]
     return [(name, key == number) for name, number in zip(names, found, strict=True)]
 
 
@@ -94,7 +97,8 @@ def plot_log(log: Log, fields: Sequence[str], choice: Choice, path: Path) -> Non
         panel.set_title(wanted + (f" ({shown})" if shown else ""), fontsize="medium")
         panel.grid(visible=True, alpha=0.3)
         if len(lines) > 1:
-            panel.legend(loc="upper right", fontsize="small", ncols=min(4, len(lines)))
+            columns = 1 + (len(lines) - 1) // 8
+            panel.legend(loc="upper left", bbox_to_anchor=(1.0, 1.02), fontsize="x-small", ncols=columns)
     axes[-1, 0].set_xlabel("time from the log's beginning (s)")
     _save(figure, path)
 

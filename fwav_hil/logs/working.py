@@ -24,7 +24,7 @@ class Working:
 
     def __call__(self, done: int, total: int) -> None:
         """Take note that `done` of `total` is done."""
-        if self._bar is None and self._clock.now_ns() < self._next_ns:
+        if self._bar is None and (done >= total or self._clock.now_ns() < self._next_ns):
             return
         if not sys.stderr.isatty():
             self._next_ns = self._clock.now_ns() + _PERIOD_NS
