@@ -47,6 +47,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         ),
         "diff": ("fwav_hil.replay.diff_command:diff_command", "Compare two logs, sample by sample."),
         "report": ("fwav_hil.cli:report_command", "Score and plot a run folder again."),
+        "log": ("fwav_hil.logs.command:log_group", "Read telemetry logs: info, dump, plot, export."),
     }
 )
 

@@ -83,11 +83,23 @@ def compiled(function: Kernel) -> Kernel:
 
     No fast-math: the same expression must give the same bits in the control process and in `simulate`.
     """
+    return _compile(function, forceinline=False)
+
+
+def inlined(function: Kernel) -> Kernel:
+    """As `compiled`, but part of each kernel that calls it.
+
+    For the innermost loops: a call that hands arrays over costs as much as copying a short frame.
+    """
+    return _compile(function, forceinline=True)
+
+
+def _compile(function: Kernel, *, forceinline: bool) -> Kernel:
     config: Any = numba.config
     place = config.CACHE_DIR
     config.CACHE_DIR = str(cache_folder())  # read by numba while it decorates, and nowhere later
     try:
-        return cast("Kernel", numba.njit(cache=True, error_model="numpy")(function))
+        return cast("Kernel", numba.njit(cache=True, error_model="numpy", forceinline=forceinline)(function))
     finally:
         config.CACHE_DIR = place
 

@@ -23,3 +23,10 @@ def layouts() -> Mapping[int, Layout]:
 def layouts_by_name() -> Mapping[str, Layout]:
     """Every message by its name."""
     return {message.name: message for message in layouts().values()}
+
+
+def unit(message: str, field: str) -> str:
+    """The unit of a field as the dialect writes it ("m/s"); empty where it has none, or is no message of the dialect."""
+    known = layouts_by_name().get(message)
+    units = widest.mavlink_map[known.message_id].fieldunits_by_name if known else {}
+    return str(units.get(field, ""))

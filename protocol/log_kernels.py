@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from protocol.compiled import compiled
+from protocol.compiled import compiled, inlined
 
 Bytes = npt.NDArray[np.uint8]
 Table = npt.NDArray[np.int32]
@@ -43,16 +43,28 @@ KNOWN, LEARNED = 1 << 16, 1 << 25
 SIZE_SHIFT, LEARNED_SHIFT = 8, 17
 _OWN = KNOWN | 0xFFFF
 
-POSITION, SEARCH, COUNT, LAST_STAMP, RAW_STAMP, SIGNATURE, DAMAGED, CRC_FAILURES, RESYNCHRONISATIONS, CUT, LEARNT = (
-    range(11)
-)
-STATE_SIZE = 11
+(
+    POSITION,
+    SEARCH,
+    COUNT,
+    LAST_STAMP,
+    RAW_STAMP,
+    SIGNATURE,
+    DAMAGED,
+    CRC_FAILURES,
+    RESYNCHRONISATIONS,
+    CUT,
+    UNSTAMPED,
+    LEARNT,
+) = range(12)
+STATE_SIZE = 12
 
 _DAY_US = 86_400_000_000
 _SIMULATION_OR_DATE_US = 1 << 52  # the year 2112; simulation times begin at 0
 _AGREEING = 2  # frames beyond the first that must agree on a seed
 _MINUTE_US = 60_000_000
 _LOOK_AHEAD = 8
+_1, _2, _3, _4, _5, _6, _7 = (np.uint64(n) for n in range(1, 8))
 
 
 def _crc_tables() -> Table:
@@ -68,36 +80,46 @@ def _crc_tables() -> Table:
 
 
 _TABLES = _crc_tables()
+_FLAT = _TABLES.reshape(-1)
 _BY_HIGH_BYTE = np.zeros(256, dtype=np.int32)
 _BY_HIGH_BYTE[_TABLES[0] >> 8] = np.arange(256, dtype=np.int32)  # the high bytes are a permutation
 
 
 @compiled
 def byte(data: Bytes, at: int) -> int:
-    """data[at] as a signed number: an unsigned one and a signed one together would be a float here."""
-    return int(np.int64(data[at]))
+    """data[at] as a signed number; both casts are for speed and for numba's rules of types.
+
+    An unsigned number and a signed one together would be a float; a signed index is first looked at for its sign.
+    """
+    return int(np.int64(data[np.uint64(at)]))
 
 
 @compiled
+def table_entry(row: int, number: int) -> int:
+    """One value of the checksum's tables."""
+    return int(_FLAT[np.uint64(row << 8 | number)])
+
+
+@inlined
 def crc_of(data: Bytes, start: int, stop: int) -> int:
     """Checksum of data[start:stop], without a seed; eight bytes at a time."""
     crc = 0xFFFF
     i = start
     while i + 8 <= stop:
-        crc ^= byte(data, i) | (byte(data, i + 1) << 8)
+        crc ^= byte(data, i) | byte(data, i + 1) << 8
         crc = (
-            int(_TABLES[7, crc & 0xFF])
-            ^ int(_TABLES[6, crc >> 8])
-            ^ int(_TABLES[5, byte(data, i + 2)])
-            ^ int(_TABLES[4, byte(data, i + 3)])
-            ^ int(_TABLES[3, byte(data, i + 4)])
-            ^ int(_TABLES[2, byte(data, i + 5)])
-            ^ int(_TABLES[1, byte(data, i + 6)])
-            ^ int(_TABLES[0, byte(data, i + 7)])
+            table_entry(7, crc & 0xFF)
+            ^ table_entry(6, crc >> 8)
+            ^ table_entry(5, byte(data, i + 2))
+            ^ table_entry(4, byte(data, i + 3))
+            ^ table_entry(3, byte(data, i + 4))
+            ^ table_entry(2, byte(data, i + 5))
+            ^ table_entry(1, byte(data, i + 6))
+            ^ table_entry(0, byte(data, i + 7))
         )
         i += 8
     while i < stop:
-        crc = (crc >> 8) ^ int(_TABLES[0, (crc ^ byte(data, i)) & 0xFF])
+        crc = (crc >> 8) ^ table_entry(0, (crc ^ byte(data, i)) & 0xFF)
         i += 1
     return crc
 
@@ -144,7 +166,7 @@ def checksum_verdict(data: Bytes, at: int, table: Table) -> int:
     crc = crc_of(data, at + 1, end)
     rest = (byte(data, end) | byte(data, end + 1) << 8) ^ (crc >> 8)
     seed = int(_BY_HIGH_BYTE[rest >> 8])
-    if int(_TABLES[0, seed]) != rest:
+    if table_entry(0, seed) != rest:
         return -257
     seed ^= crc & 0xFF
     if entry & KNOWN and seed == (entry & 0xFF):
@@ -246,6 +268,64 @@ def best_of_overlapping(data: Bytes, at: int, floor: int, table: Table, last: in
     return best
 
 
+@inlined
+def write_row(
+    data: Bytes, at: int, length: int, stamp: int, known: int, frames: npt.NDArray[np.void], count: int
+) -> None:
+    """Write the columns of the frame at `at`, `length` bytes long, into row `count`."""
+    row = frames[count]
+    row["stamp_us"] = stamp
+    row["offset"] = at
+    row["length"] = length
+    row["message_id"] = message_of(data, at)
+    first = at + 4 if data[np.uint64(at)] == 0xFD else at + 2
+    row["version"] = 2 if first == at + 4 else 1
+    row["flags"] = byte(data, at + 2) if first == at + 4 else 0
+    row["sequence"] = byte(data, first)
+    row["system"] = byte(data, first + 1)
+    row["component"] = byte(data, first + 2)
+    row["signed"] = signature_size(data, at) > 0
+    row["known"] = known
+    row["stamp_ok"] = stamp >= 0
+
+
+@compiled
+def take_run(
+    data: Bytes, until: int, stamp_size: int, table: Table, state: State, frames: npt.NDArray[np.void]
+) -> None:
+    """The way through a log without damage: records of known messages, one behind the other. Stops before any other."""
+    floor, count, last, raw, signature = state[POSITION], state[COUNT], state[LAST_STAMP], state[RAW_STAMP], 0
+    size, room = data.shape[0] - 12, frames.shape[0]
+    begun = count
+    while floor < until and count < room:
+        at = floor + stamp_size
+        if at > size or (data[np.uint64(at)] != 0xFD and data[np.uint64(at)] != 0xFE):
+            break
+        end = frame_end(data, at)
+        entry = int(table[np.uint64(message_of(data, at))])
+        signature = signature_size(data, at)
+        if not entry & KNOWN or end + signature > size + 10:
+            break
+        if data[np.uint64(at)] == 0xFE and end - at - 6 > (entry >> SIZE_SHIFT & 0xFF):
+            break
+        crc = crc_of(data, at + 1, end)
+        crc = (crc >> 8) ^ table_entry(0, (crc ^ entry) & 0xFF)
+        if crc != (byte(data, end) | byte(data, end + 1) << 8):
+            break
+        stamp = -1
+        if stamp_size:
+            stamp = stamp_at(data, floor)
+            if near(stamp, last) or (raw >= 0 and near(stamp, raw)):
+                last = stamp
+            raw = stamp
+        floor = end + 2 + signature
+        write_row(data, at, floor - at, stamp, 1, frames, count)
+        count += 1
+    if count > begun:
+        state[POSITION], state[COUNT], state[LAST_STAMP], state[RAW_STAMP] = floor, count, last, raw
+        state[SIGNATURE] = signature_size(data, frames[count - 1]["offset"])
+
+
 @compiled
 def scan_slice(
     data: Bytes, until: int, stamp_size: int, table: Table, votes: Table, state: State, frames: npt.NDArray[np.void]
@@ -255,6 +335,8 @@ def scan_slice(
     `state` carries on from call to call: begin with zeros, but SEARCH, LAST_STAMP and RAW_STAMP -1.
     """
     while True:
+        if state[SEARCH] < 0:
+            take_run(data, until, stamp_size, table, state, frames)
         floor = state[POSITION]  # the end of the record before
         if floor >= until:
             return True
@@ -265,7 +347,11 @@ def scan_slice(
         if state[SEARCH] < 0:
             at = floor + stamp_size
             verdict = checksum_verdict(data, at, table)
-            if verdict < 0:
+            if verdict <= 0 and stamp_size and checksum_verdict(data, floor, table) > 0:
+                # A record may hold several frames behind one stamp, as QGroundControl writes what it sends.
+                at = floor
+                verdict = checksum_verdict(data, at, table)
+            elif verdict < 0:
                 message = message_of(data, at)
                 fits = verdict > -257 and unknown_fits(data, at, table, state[LAST_STAMP], stamp_size)
                 if fits:
@@ -308,7 +394,8 @@ def scan_slice(
 def take(data: Bytes, at: int, verdict: int, stamp_size: int, state: State, frames: npt.NDArray[np.void]) -> None:
     """Write the row of the frame at `at`, and go on behind it."""
     floor = state[POSITION]
-    if at - stamp_size < floor and state[SIGNATURE] and state[COUNT]:
+    reaches_back = at - stamp_size < floor and near(stamp_at(data, at - stamp_size), state[LAST_STAMP])
+    if state[SIGNATURE] and (at < floor or (stamp_size and reaches_back)):
         # The frame before has its checksum but not the whole signature that it announced.
         last = frames[state[COUNT] - 1]
         whole = floor - state[SIGNATURE]
@@ -320,31 +407,15 @@ def take(data: Bytes, at: int, verdict: int, stamp_size: int, state: State, fram
         state[DAMAGED] += at - floor
     else:
         state[DAMAGED] += at - stamp_size - floor
-    row = frames[state[COUNT]]
     end = frame_end(data, at) + 2
     signature = signature_size(data, at)
-    row["stamp_us"] = stamp
-    row["offset"] = at
-    row["message_id"] = message_of(data, at)
-    row["length"] = end + signature - at
-    if data[at] == 0xFD:
-        row["version"] = 2
-        row["flags"] = data[at + 2]
-        row["sequence"] = data[at + 4]
-        row["system"] = data[at + 5]
-        row["component"] = data[at + 6]
+    write_row(data, at, end + signature - at, stamp, verdict == 1, frames, state[COUNT])
+    if stamp_size and at == floor:
+        state[UNSTAMPED] += 1
     else:
-        row["version"] = 1
-        row["flags"] = 0
-        row["sequence"] = data[at + 2]
-        row["system"] = data[at + 3]
-        row["component"] = data[at + 4]
-    row["signed"] = signature > 0
-    row["known"] = verdict == 1
-    row["stamp_ok"] = stamp >= 0
-    if near(stamp, state[LAST_STAMP]) or (stamp >= 0 and near(stamp, state[RAW_STAMP]) and state[RAW_STAMP] >= 0):
-        state[LAST_STAMP] = stamp
-    state[RAW_STAMP] = stamp
+        if near(stamp, state[LAST_STAMP]) or (state[RAW_STAMP] >= 0 and near(stamp, state[RAW_STAMP])):
+            state[LAST_STAMP] = stamp
+        state[RAW_STAMP] = stamp
     state[SIGNATURE] = signature
     state[POSITION] = end + signature
     state[COUNT] += 1
@@ -419,6 +490,22 @@ def count_rows(frames: npt.NDArray[np.void], chosen: npt.NDArray[np.uint8], slot
                 counts[slot - 1] += 1
 
 
+@inlined
+def copy_bytes(source: Bytes, start: int, target: Bytes, place: int, count: int) -> None:
+    """Copy bytes, eight at a time: read all before any is written, so that the compiler makes one move of them."""
+    k = 0
+    while k + 8 <= count:
+        i, j = np.uint64(start + k), np.uint64(place + k)
+        b0, b1, b2, b3 = source[i], source[i + _1], source[i + _2], source[i + _3]
+        b4, b5, b6, b7 = source[i + _4], source[i + _5], source[i + _6], source[i + _7]
+        target[j], target[j + _1], target[j + _2], target[j + _3] = b0, b1, b2, b3
+        target[j + _4], target[j + _5], target[j + _6], target[j + _7] = b4, b5, b6, b7
+        k += 8
+    while k < count:
+        target[np.uint64(place + k)] = source[np.uint64(start + k)]
+        k += 1
+
+
 @compiled
 def fill_rows(
     data: Bytes,
@@ -439,17 +526,17 @@ def fill_rows(
         frame = frames[i]
         if not frame["known"] or frame["flags"] & 0xFE or (chosen.shape[0] > 0 and not chosen[i]):
             continue
-        slot = slots[frame["message_id"]] - 1
+        slot = int(slots[np.uint64(frame["message_id"])]) - 1
         if slot < 0:
             continue
-        place, size = places[slot], sizes[slot]
-        places[slot] = place + head + size
+        place, size = places[np.uint64(slot)], sizes[np.uint64(slot)]
+        places[np.uint64(slot)] = place + head + size
         stamp = frame["stamp_us"]
         for k in range(8):
-            rows[place + k] = stamp >> (8 * k) & 0xFF
-        rows[place + 8] = frame["system"]
-        rows[place + 9] = frame["component"]
-        rows[place + 10] = frame["sequence"]
+            rows[np.uint64(place + k)] = stamp >> (8 * k) & 0xFF
+        rows[np.uint64(place + 8)] = frame["system"]
+        rows[np.uint64(place + 9)] = frame["component"]
+        rows[np.uint64(place + 10)] = frame["sequence"]
         at = frame["offset"]
         first = at + (10 if frame["version"] == 2 else 6)
         place += head

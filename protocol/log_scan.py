@@ -16,7 +16,7 @@ Columns of `Scan.frames` (dtype `log_kernels.FRAME`):
     signed      1 where a signature is behind the frame (whether it is a good one, only the key's owner can tell)
     flags       incompatibility flags (MAVLink 2)
     known       1: the dialect has the message and the checksum holds; 0: the dialect lacks it, so there is no definition
-    stamp_ok    0 where the stamp was damaged or lost
+    stamp_ok    0 where the frame has no stamp of its own, or a damaged one
 
 What is damaged is counted, never an error: bytes inserted, removed or changed cost the frames that they hit, no other.
 Read logs of QGroundControl, MAVProxy, mavlink-router, pymavlink and this project so, and raw streams without stamps.
@@ -45,6 +45,7 @@ COUNTERS = (
     "crc_failures",
     "resynchronisations",
     "cut_signatures",
+    "unstamped_frames",
     "damaged_stamps",
     "truncated_tail",
     "unknown_frames",
@@ -67,6 +68,7 @@ class Scan:
                 crc_failures        frames where one was expected whose checksum failed
                 resynchronisations  times the next record was found by searching
                 cut_signatures      frames whose signature is not whole
+                unstamped_frames    frames that follow another under one stamp, as in a record of several
                 damaged_stamps      frames whose stamp was lost or absurd
                 truncated_tail      bytes of a record that the end of the file cuts short
                 unknown_frames      frames of messages the dialect lacks (kept)
@@ -157,9 +159,11 @@ def _scan(
 
 
 def _is_raw(frames: npt.NDArray[np.void]) -> bool:
-    """Whether most frames begin where the one before ends: a stream that was written without stamps."""
+    """Whether frame follows on frame: a stream that was written without stamps."""
+    if len(frames) == 1:
+        return bool(frames["offset"][0] == 0)
     gaps = frames["offset"][1:] - (frames["offset"] + frames["length"])[:-1]
-    return bool(np.count_nonzero(gaps == 0) > len(gaps) / 2) if len(gaps) else len(frames) > 0 == frames["offset"][0]
+    return bool(np.count_nonzero(gaps == 0) > 9 * np.count_nonzero(gaps == STAMP_SIZE))
 
 
 def _count(
@@ -174,7 +178,8 @@ def _count(
     tail = "truncated_tail" if kernels.is_cut_short(data, int(state[kernels.POSITION]), stamp_size) else "damaged_bytes"
     counters[tail] += rest
     if stamp_size:
-        counters["damaged_stamps"] = int(kernels.mend_stamps(frames))
+        counters["unstamped_frames"] = int(state[kernels.UNSTAMPED])
+        counters["damaged_stamps"] = int(kernels.mend_stamps(frames)) - counters["unstamped_frames"]
     else:
         frames["stamp_us"] = 0
     counters["unknown_frames"] = int(np.count_nonzero(frames["known"] == 0))

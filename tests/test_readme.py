@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import click
 import pytest
 
-from fwav_hil.cli import COMMANDS
+from fwav_hil.cli import COMMANDS, cli
 from protocol.scenario import find_scenario
 from protocol.streams import markdown_table
 
@@ -29,5 +30,8 @@ def test_every_link_of_a_page_leads_somewhere(page: Path) -> None:
 def test_every_command_of_a_page_exists(page: Path) -> None:
     for name, scenario in re.findall(r"^ {4}fwav-hil (\w+) +(\S+)?", page.read_text(encoding="utf-8"), re.MULTILINE):
         assert name in COMMANDS
-        if scenario and not scenario.startswith(("-", "runs/")):
+        command = cli.get_command(click.Context(cli), name)
+        if isinstance(command, click.Group):
+            assert scenario in command.commands
+        elif scenario and not scenario.startswith(("-", "runs/")):
             assert find_scenario(scenario).exists()

@@ -115,7 +115,7 @@ class TestPairs:
             for time_ms in times:
                 log.add("ATTITUDE", time_boot_ms=time_ms, roll=float(time_ms))
             logs.append(log.scan)
-        difference = compare_logs(*logs, EXACT)
+        difference = compare_logs(logs[0], logs[1], EXACT)
         expected = sum(min(first.count(t), second.count(t)) for t in set(first))
         assert sum(one.pairs for one in difference.fields if one.field == "roll") == expected
         assert not any(one.changed for one in difference.fields), "paired by time: the values follow from it"

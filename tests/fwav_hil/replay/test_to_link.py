@@ -188,7 +188,7 @@ class TestLoop:
                 replay.player._look = lambda player: player.stop() if player.passes == 3 else None
                 play(loop=loop)
 
-            replay.player.play = stop_after_three  # type: ignore[method-assign]
+            replay.player.play = stop_after_three  # type: ignore[assignment, method-assign]
             result = replay.run()
             while data := far.recv(0.0):
                 times.append(mavlink_map.decode_tick_time_ns(data[10:-2]))

@@ -1,0 +1,1 @@
+"""Reading logs: `fwav-hil log info`, `dump`, `plot`, `export`."""

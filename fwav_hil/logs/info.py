@@ -1,0 +1,158 @@
+"""What is in a log, and what is missing or damaged: `fwav-hil log info`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.table import Table
+
+from protocol.log_dialect import layouts
+from protocol.log_files import Log
+from protocol.log_scan import Scan
+from protocol.log_sequences import count_losses
+
+GAP = 3.0
+"""An interval longer than this many times the usual (median) one is a gap."""
+
+PLACES_SHOWN = 20
+_YEAR_2000_S = 946_684_800.0
+
+
+def log_info(log: Log) -> dict[str, Any]:
+    """All that `log info` says, as plain values; times in seconds.
+
+    kind, bytes, start_s (of the first record), duration_s, messages, rate_hz; systems (MAVLink logs: system, component,
+    messages, lost, out_of_order, versions, signed); types (name, system, component, count, rate_hz, interval_s: the median,
+    gaps, longest_gap_s); damage (counters, and places: offset and bytes of the first stretches of damage).
+    """
+    first, last = log.span_us()
+    count = len(log.scan) if log.scan is not None else sum(len(table) for table in log.tables().values())
+    duration_s = (last - first) / 1e6
+    return {
+        "log": str(log.path),
+        "kind": log.kind,
+        "bytes": log.path.stat().st_size,
+        "start_s": first / 1e6,
+        "duration_s": duration_s,
+        "messages": count,
+        "rate_hz": (count - 1) / duration_s if duration_s > 0 else None,
+        "systems": _systems(log.scan) if log.scan is not None else [],
+        "types": _types_of_scan(log.scan) if log.scan is not None else _types_of_tables(log),
+        "damage": dict(log.counters) | ({"places": _places(log.scan)} if log.scan is not None else {}),
+    }
+
+
+def _systems(scan: Scan) -> list[dict[str, Any]]:
+    rows = []
+    for (system, component), (lost, out_of_order) in count_losses(scan).items():
+        frames = scan.frames[(scan.frames["system"] == system) & (scan.frames["component"] == component)]
+        rows.append(
+            {
+                "system": system,
+                "component": component,
+                "messages": len(frames),
+                "lost": lost,
+                "out_of_order": out_of_order,
+                "versions": [int(version) for version in np.unique(frames["version"])],
+                "signed": int(np.count_nonzero(frames["signed"])),
+            }
+        )
+    return rows
+
+
+def _types_of_scan(scan: Scan) -> list[dict[str, Any]]:
+    """One row for each message of each sender, in order of names."""
+    frames = scan.frames
+    key = frames["message_id"].astype(np.int64) << 16 | frames["system"].astype(np.int64) << 8 | frames["component"]
+    order = np.argsort(key, kind="stable")
+    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+    rows = []
+    for start, end in zip(starts, [*starts[1:], len(order)], strict=True):
+        frame = frames[order[start]]
+        number = int(frame["message_id"])
+        name = layouts()[number].name if frame["known"] else f"UNKNOWN_{number}"
+        sender = {"system": int(frame["system"]), "component": int(frame["component"])}
+        rows.append({"name": name, **sender} | _pace(frames["stamp_us"][order[start:end]]))
+    return sorted(rows, key=lambda row: (row["name"], row["system"], row["component"]))
+
+
+def _types_of_tables(log: Log) -> list[dict[str, Any]]:
+    return [
+        {"name": name, "system": None, "component": None} | _pace(table["t_us"]) for name, table in log.tables().items()
+    ]
+
+
+def _pace(stamps_us: npt.NDArray[np.int64]) -> dict[str, Any]:
+    """Count, rate and gaps of records at these times."""
+    intervals = np.diff(stamps_us) / 1e6
+    usual = float(np.median(intervals)) if len(intervals) else None
+    span = float(intervals.sum())
+    return {
+        "count": len(stamps_us),
+        "rate_hz": len(intervals) / span if span > 0 else None,
+        "interval_s": usual,
+        "gaps": int(np.count_nonzero(intervals > GAP * usual)) if usual else 0,
+        "longest_gap_s": float(intervals.max()) if len(intervals) else None,
+    }
+
+
+def _places(scan: Scan) -> list[dict[str, int]]:
+    """The first stretches of bytes between records that belong to none."""
+    begins = scan.frames["offset"].astype(np.int64) - scan.stamp_size
+    ends = np.concatenate([[0], scan.ends()])
+    sizes = np.append(begins, len(scan.data)) - ends
+    where = np.flatnonzero(sizes > 0)[:PLACES_SHOWN]
+    return [{"offset": int(ends[at]), "bytes": int(sizes[at])} for at in where]
+
+
+def print_info(info: dict[str, Any], *, to_stderr: bool = False) -> None:
+    """Print what `log_info` gives."""
+    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr)
+    rate = f", {info['rate_hz']:.0f} a second" if info["rate_hz"] else ""
+    console.print(f"{info['log']}: {info['kind']}, {info['bytes']} bytes")
+    console.print(
+        f"{info['messages']} messages in {info['duration_s']:.3f} s{rate}, from {_moment(info['start_s'])} on"
+    )
+    if info["systems"]:
+        console.print(_systems_table(info["systems"]))
+    console.print(_types_table(info["types"]))
+    damage = {name: value for name, value in info["damage"].items() if value and name != "places"}
+    console.print("damage: " + (", ".join(f"{name} {value}" for name, value in damage.items()) or "none"))
+    places = info["damage"].get("places", [])
+    if places:
+        shown = ", ".join(f"{place['offset']} ({place['bytes']})" for place in places)
+        console.print(f"at byte (bytes): {shown}" + (" ..." if len(places) == PLACES_SHOWN else ""))
+
+
+def _moment(t_s: float) -> str:
+    """A date where the stamps are dates, else the time that they count."""
+    if t_s < _YEAR_2000_S:
+        return f"t = {t_s:.6f} s"
+    return str(np.datetime64(round(1e3 * t_s), "ms")).replace("T", " ") + " UTC"
+
+
+def _systems_table(rows: list[dict[str, Any]]) -> Table:
+    table = Table(title="senders", title_justify="left")
+    for column in ("system", "component", "messages", "lost", "out of order", "MAVLink", "signed"):
+        table.add_column(column, justify="right")
+    for row in rows:
+        versions = ", ".join(map(str, row["versions"]))
+        signed = "no" if not row["signed"] else "yes" if row["signed"] == row["messages"] else str(row["signed"])
+        cells = (row[name] for name in ("system", "component", "messages", "lost", "out_of_order"))
+        table.add_row(*map(str, cells), versions, signed)
+    return table
+
+
+def _types_table(rows: list[dict[str, Any]]) -> Table:
+    table = Table("message", title="messages", title_justify="left")
+    for column in ("from", "count", "rate", "gaps", "longest"):
+        table.add_column(column, justify="right")
+    for row in rows:
+        sender = f"{row['system']}.{row['component']}" if row["system"] is not None else ""
+        rate = f"{row['rate_hz']:.4g} Hz" if row["rate_hz"] else "-"
+        longest = f"{row['longest_gap_s']:.4g} s" if row["longest_gap_s"] is not None else "-"
+        table.add_row(row["name"], sender, str(row["count"]), rate, str(row["gaps"]), longest)
+    return table

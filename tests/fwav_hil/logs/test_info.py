@@ -1,0 +1,90 @@
+"""`fwav-hil log info`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.fwav_hil.logs.conftest import COUNT, Shell, flight
+from tests.protocol.log_records import DAY_US, FOREIGN
+
+
+def test_what_a_flight_holds(shell: Shell, flight_log: Path) -> None:
+    ended = shell("info", flight_log, "--json", "-")
+    assert ended.code == 0
+    info = json.loads(ended.out)
+    assert info["kind"] == "MAVLink telemetry log"
+    assert info["messages"] == 2 * COUNT + 1
+    assert info["start_s"] == DAY_US / 1e6
+    assert info["duration_s"] == pytest.approx(5.9, abs=1e-5)
+    assert info["bytes"] == flight_log.stat().st_size
+    assert [(row["system"], row["component"], row["messages"]) for row in info["systems"]] == [(1, 1, 51), (1, 191, 50)]
+    pose = next(row for row in info["types"] if row["name"] == "ATT_POS_MOCAP")
+    assert (pose["count"], pose["gaps"], pose["longest_gap_s"], pose["interval_s"]) == (COUNT, 1, 1.1, 0.1)
+    assert pose["rate_hz"] == pytest.approx(49 / 5.9)
+    assert [row["name"] for row in info["types"]] == ["ATT_POS_MOCAP", "HIL_ACTUATOR_CONTROLS", "STATUSTEXT"]
+    assert not any(value for value in info["damage"].values())
+    assert "2023-11-14 22:13:20.000 UTC" in ended.err
+
+
+def test_the_table_on_a_terminal_says_the_same(shell: Shell, flight_log: Path) -> None:
+    ended = shell("info", flight_log)
+    assert (ended.code, ended.err) == (0, "")
+    assert "101 messages in 5.900 s" in ended.out
+    assert "damage: none" in ended.out
+    (row,) = (line for line in ended.out.splitlines() if "ATT_POS_MOCAP" in line)
+    assert [cell.strip() for cell in row.split("│")[2:-1]] == ["1.191", "50", "8.305 Hz", "1", "1.1 s"]
+
+
+def test_losses_are_counted_by_sender(shell: Shell, tmp_path: Path) -> None:
+    records = flight()
+    del records[20:26]  # three of each
+    records[60], records[62] = records[62], records[60]  # a pair of the emulator's, the wrong way round
+    (tmp_path / "lossy.tlog").write_bytes(b"".join(record.data for record in records))
+    rows = json.loads(shell("info", "lossy.tlog", "--json", "-").out)["systems"]
+    # What is late was counted as lost when the one after it came.
+    assert [(row["component"], row["lost"], row["out_of_order"]) for row in rows] == [(1, 3, 0), (191, 4, 1)]
+
+
+def test_damage_unknown_messages_versions_and_signatures(shell: Shell, mixed_log: Path) -> None:
+    info = json.loads(shell("info", mixed_log, "--json", "-").out)
+    assert info["messages"] == 117
+    assert info["damage"]["crc_failures"] == 2
+    assert info["damage"]["unknown_frames"] == 30
+    assert info["damage"]["truncated_tail"] > 0
+    assert len(info["damage"]["places"]) == 3
+    by_system = {row["system"]: row for row in info["systems"]}
+    assert by_system[1]["versions"] == [1, 2]
+    assert by_system[2]["signed"] == by_system[2]["messages"]
+    assert by_system[1]["signed"] == 0
+    assert f"UNKNOWN_{FOREIGN[0]}" in {row["name"] for row in info["types"]}
+    assert "crc_failures 2" in shell("info", mixed_log).out
+
+
+def test_a_run_folder_stands_for_its_log(shell: Shell, flight_log: Path, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    flight_log.rename(tmp_path / "run" / "run.tlog")
+    assert shell("info", "run").code == 0
+
+
+@pytest.mark.parametrize("content", [b"", b"this is prose\n" * 100, bytes(1000)])
+def test_what_is_no_log_ends_with_one_sentence(shell: Shell, tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "x.tlog").write_bytes(content)
+    for command in (("info",), ("dump",), ("export", "--to", "csv")):
+        ended = shell(command[0], "x.tlog", *command[1:])
+        assert (ended.code, ended.out) == (6, "")
+        assert ended.err.startswith("fwav-hil: x.tlog holds no message: ")
+        assert len(ended.err.splitlines()) == 1
+
+
+def test_what_is_not_there_is_named(shell: Shell) -> None:
+    assert shell("info", "no.tlog") == (6, "", "fwav-hil: cannot read the log no.tlog: No such file or directory\n")
+
+
+def test_a_raw_stream(shell: Shell, tmp_path: Path) -> None:
+    (tmp_path / "flight.raw").write_bytes(b"".join(record.frame for record in flight()))
+    info = json.loads(shell("info", "flight.raw", "--json", "-").out)
+    assert info["kind"] == "raw MAVLink stream (no time stamps)"
+    assert (info["messages"], info["duration_s"], info["rate_hz"]) == (101, 0.0, None)
