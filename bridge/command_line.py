@@ -61,19 +61,23 @@ json_option = click.option(
 
 
 class DurationNs(click.ParamType[int]):
-    """A time with its unit, such as 5ms, 250us or 0.1s; gives whole nanoseconds."""
+    """A time with its unit, such as 5ms, 250us or 0.1s, up to a second as a scenario's delay; gives whole nanoseconds."""
 
     name = "time"
     _UNITS: ClassVar[dict[str, float]] = {"ns": 1.0, "us": 1e3, "ms": 1e6, "s": 1e9}
+    _LONGEST_NS = 1_000_000_000
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
         """Nanoseconds of a text, or fail with the sentence that names the remedy."""
         if isinstance(value, int):
             return value
-        match = re.fullmatch(r"(\d+\.?\d*|\.\d+)(ns|us|ms|s)", value.strip())
+        match = re.fullmatch(r"(\d+\.?\d*|\.\d+)(ns|us|ms|s)", value.strip(), re.ASCII)
         if not match:
             self.fail(f"{value!r} is no time: write a number and its unit, such as 5ms, 250us or 0.1s", param, ctx)
-        return round(float(match[1]) * self._UNITS[match[2]])
+        time_ns = float(match[1]) * self._UNITS[match[2]]
+        if time_ns > self._LONGEST_NS:
+            self.fail(f"{value!r} is more than a second, with which nothing flies: write a shorter time", param, ctx)
+        return round(time_ns)
 
 
 delay_option = click.option(

@@ -9,13 +9,14 @@ from bridge.link import Link
 from protocol.errors import LinkClosedError
 
 _SPIN_NS = 200_000
-"""The last of a wait is polled through: a sleep would end up to this much late, which would be a delay of its own."""
+"""The last of a delay is polled through: a sleep would end up to this much late, which would be a delay of its own."""
 
 
 class DelayedLink(Link):
     """A link whose receiving end gets everything later by a fixed wall time, in the order in which it came.
 
-    The delay counts from the kernel's receive time where the link tells it, else from when the datagram was fetched.
+    The delay counts from the kernel's receive time where the link tells it, else from when the datagram was fetched. What
+    is counted (`stats`) is what the link itself received and sent.
     """
 
     def __init__(self, link: Link, delay_ns: int, clock: Clock) -> None:
@@ -32,17 +33,20 @@ class DelayedLink(Link):
         """What the link delivered a delay ago, or None; see `Link.recv`."""
         give_up_ns = self._clock.now_ns() + round(max(0.0, timeout_s) * 1e9)
         while True:
+            if self._closed:
+                raise LinkClosedError(f"{self.uri} is closed on this end")
             now_ns = self._clock.now_ns()
             if self._held and self._held[0][0] <= now_ns:
                 _, self.received_ns, data = self._held.popleft()
                 return data
             if self._ended_by and not self._held:
                 raise self._ended_by
-            until_ns = min(give_up_ns, self._held[0][0]) if self._held else give_up_ns
-            if self._ended_by:
-                self._clock.sleep_until_ns(until_ns)  # what it delivered before it closed is still on its way
-                continue
-            self._fetch(max(0, until_ns - now_ns - _SPIN_NS) * 1e-9)
+            due_ns = self._held[0][0] if self._held else give_up_ns + 1
+            if self._ended_by:  # what the link delivered before it closed is still on its way
+                self._clock.sleep_until_ns(min(due_ns, give_up_ns))
+            else:
+                until_ns = due_ns - _SPIN_NS if due_ns <= give_up_ns else give_up_ns
+                self._fetch(max(0, until_ns - now_ns) * 1e-9)
             if now_ns >= give_up_ns:
                 return None
 
@@ -53,9 +57,18 @@ class DelayedLink(Link):
         except LinkClosedError as error:
             self._ended_by = error
             return
-        if data:
+        if data is not None:
             came_ns = self._link.received_ns or self._clock.now_ns()
             self._held.append((came_ns + self._delay_ns, self._link.received_ns, data))
+
+    @property
+    def spin_s(self) -> float:
+        """The link's."""
+        return self._link.spin_s
+
+    @spin_s.setter
+    def spin_s(self, value: float) -> None:
+        self._link.spin_s = value
 
     def send(self, data: bytes | bytearray | memoryview) -> None:
         """Send at once."""
@@ -67,6 +80,7 @@ class DelayedLink(Link):
 
     def close(self) -> None:
         """Close the link; what is on its way is lost."""
+        self._closed = True
         self._link.close()
 
     @property

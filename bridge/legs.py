@@ -6,6 +6,7 @@ command echoes, so the rows of both ends join; `TimeSync` says how their clocks 
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -24,28 +25,34 @@ SAMPLE_COLUMNS = ("t_ns", "kernel_ns", "woke_ns", "computed_ns", "sent_ns")
 EMULATOR_FILE, CONTROLLER_FILE = "legs_emulator.npz", "legs_controller.npz"
 
 Rows = npt.NDArray[np.int64]
-_GROWTH = 65536
+_TABLES = {"ticks": TICK_COLUMNS, "answers": ANSWER_COLUMNS, "samples": SAMPLE_COLUMNS}
+_BLOCK = 65536
 
 
 class LegTable:
-    """Rows of stamps that grow in large steps, so that adding one allocates nothing as a rule."""
+    """Rows of stamps, in large blocks: adding one allocates nothing as a rule, and never moves those that are there."""
 
     def __init__(self, columns: tuple[str, ...]) -> None:
         self.columns = columns
-        self._rows: Rows = np.zeros((_GROWTH, len(columns)), dtype=np.int64)
+        self._blocks: list[Rows] = []
+        self._count = _BLOCK
+        self._begin_block()
+
+    def _begin_block(self) -> None:
+        self._blocks.append(np.zeros((_BLOCK, len(self.columns)), dtype=np.int64))
         self._count = 0
 
     def add(self, *stamps_ns: int) -> None:
         """Add a row."""
-        if self._count == len(self._rows):
-            self._rows = np.vstack([self._rows, np.zeros_like(self._rows)])
-        self._rows[self._count] = stamps_ns
+        if self._count == _BLOCK:
+            self._begin_block()
+        self._blocks[-1][self._count] = stamps_ns
         self._count += 1
 
     @property
     def rows(self) -> Rows:
         """What was added, a row each."""
-        return self._rows[: self._count]
+        return np.vstack([*self._blocks[:-1], self._blocks[-1][: self._count]])
 
 
 def save_legs(path: Path, tables: dict[str, LegTable], clock: Estimate | None) -> None:
@@ -58,12 +65,25 @@ def save_legs(path: Path, tables: dict[str, LegTable], clock: Estimate | None) -
         raise RunFolderError(f"cannot write {path}: {error.strerror}; choose another folder with --out") from None
 
 
-def load_legs(path: Path) -> tuple[dict[str, Rows], Estimate | None]:
-    """The tables by name, and the clock's estimate; see `save_legs`. Raises RunFolderError where there are none."""
+def load_legs(path: Path, *names: str) -> tuple[list[Rows], Estimate | None]:
+    """The tables of these names (ticks, answers, samples), and the clock's estimate; see `save_legs`.
+
+    Raises RunFolderError where there is no such file, or not what was written.
+    """
     try:
-        with np.load(path) as file:
-            tables = {name: np.asarray(file[name]) for name in file.files}
-        offset_ns, round_trip_ns, answers = tables.pop("clock").tolist()
-    except (OSError, EOFError, KeyError, ValueError) as error:
-        raise RunFolderError(f"{path} holds no time stamps of a run ({error}): fly it with --legs") from None
+        with path.open("rb") as opened, np.load(opened) as file:  # numpy leaves open what it cannot read
+            arrays = {name: np.asarray(file[name]) for name in file.files}
+        offset_ns, round_trip_ns, answers = map(int, arrays["clock"])
+        tables = [arrays[name] for name in names]
+    except FileNotFoundError:
+        raise RunFolderError(f"there is no {path}: fly the run with --legs, which notes when all was where") from None
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+        raise _damaged(path, error) from None
+    for name, table in zip(names, tables, strict=True):
+        if table.dtype != np.int64 or table.ndim != 2 or table.shape[1] != len(_TABLES[name]):
+            raise _damaged(path, f"{name} is {table.dtype} {table.shape}")
     return tables, Estimate(offset_ns, round_trip_ns, answers) if round_trip_ns >= 0 else None
+
+
+def _damaged(path: Path, why: object) -> RunFolderError:
+    return RunFolderError(f"{path} is damaged, or holds no time stamps ({why}): fly the run again with --legs")

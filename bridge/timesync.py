@@ -33,7 +33,7 @@ class Estimate(NamedTuple):
     @property
     def error_ns(self) -> int:
         """The bound of the offset's error."""
-        return self.round_trip_ns // 2
+        return (self.round_trip_ns + 1) // 2
 
 
 class TimeSync:

@@ -17,6 +17,7 @@ Python's own socket timeout (settimeout) would poll before every receive and cou
 from __future__ import annotations
 
 import abc
+import contextlib
 import select
 import socket
 import struct
@@ -56,8 +57,9 @@ class _UdpLink(Link):
     def stamp_receives(self) -> bool:
         """Ask for SO_TIMESTAMPNS (Linux). See `Link.stamp_receives`."""
         if sys.platform == "linux":
-            self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-            self._is_stamped = True
+            with contextlib.suppress(OSError):  # a system that imitates Linux without it
+                self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+                self._is_stamped = True
         return self._is_stamped
 
     def _receive_stamped(self, flags: int) -> tuple[bytes, Address]:

@@ -176,7 +176,7 @@ class Controller:
                         self.endpoint.reader.restart_sequences([(frame.system, frame.component, frame.sequence + 1)])
                     self._samples.append(sample)
             elif frame.message_id == mavlink_map.TIMESYNC.message_id and not self._lockstep:
-                answer = self.time_sync.take(frame, self._woke_ns)
+                answer = self.time_sync.take(frame, self.endpoint.link.received_ns or self._woke_ns)
                 if answer:
                     self.endpoint.send([answer])
             else:

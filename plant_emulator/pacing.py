@@ -293,7 +293,7 @@ class RealTime(Pacing):
             return
         self._heard_ns = wall_ns
         if frame.message_id == mavlink_map.TIMESYNC.message_id:
-            answer = self.time_sync.take(frame, wall_ns)
+            answer = self.time_sync.take(frame, self.endpoint.link.received_ns or wall_ns)
             if answer:
                 self._say(answer)
             return

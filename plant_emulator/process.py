@@ -65,8 +65,8 @@ def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, s
     warm_up(scenario)
     with open_patiently(options.link, options.wait_s, stop) as link:
         link.spin_s = options.spin_s
-        if options.legs:
-            link.stamp_receives()
+        if options.legs or options.delay_ns:
+            link.stamp_receives()  # a delay counts from the arrival, not from when we got round to it
         delayed = DelayedLink(link, options.delay_ns, MonotonicClock()) if options.delay_ns else link
         return fly(scenario, delayed, options, report, stop)
 

@@ -42,6 +42,9 @@ STREAMS = (
     Stream("HIL_ACTUATOR_CONTROLS", End.CONTROLLER, None, "one for each tick; time_usec echoes the sample it answers"),
     Stream("POSITION_TARGET_LOCAL_NED", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
     Stream("ATTITUDE_TARGET", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
+    Stream(
+        "TIMESYNC", End.BOTH, 1.0, "real time only: how far the other end's clock is ahead; 20 Hz for the first ten"
+    ),
     Stream("COMMAND_LONG", End.STATION, None, "to the controller: 400 (arm, disarm)"),
     Stream("COMMAND_ACK", End.CONTROLLER, None, "the answer to it"),
 )

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.clock import MonotonicClock, PunctualClock, VirtualClock, local_stamp, unix_time_us
+from bridge.clock import MonotonicClock, PunctualClock, VirtualClock, local_stamp, unix_offset_ns, unix_time_us
 
 
 class TestMonotonicClock:
@@ -120,3 +120,30 @@ class TestPunctualClock:
             lateness_ns()
         overslept_ns = 3_000_000
         assert lateness_ns() > 2_000_000, "it has come to trust the machine again"
+
+
+class TestUnixOffset:
+    def test_it_leads_from_one_clock_to_the_other(self) -> None:
+        before_ns = time.time_ns()
+        told_ns = MonotonicClock().now_ns() + unix_offset_ns()
+        after_ns = time.time_ns()
+        assert before_ns - 1_000_000_000 < told_ns < after_ns + 1_000_000_000  # no measure: the machine may stall
+
+    def test_a_pause_between_the_readings_does_not_count(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Each reading takes 100 ns; the first two times this process is put to sleep in between."""
+        offset_ns, now_ns, pauses = 10**18, 10**12, [5_000_000, 3_000_000]
+
+        def monotonic_ns() -> int:
+            nonlocal now_ns
+            now_ns += 100
+            return now_ns
+
+        def time_ns() -> int:
+            nonlocal now_ns
+            now_ns += pauses.pop() if pauses else 0
+            return now_ns + offset_ns
+
+        monkeypatch.setattr(time, "monotonic_ns", monotonic_ns)
+        monkeypatch.setattr(time, "time_ns", time_ns)
+        assert unix_offset_ns() == offset_ns
+        assert not pauses

@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from bridge import command_line
-from bridge.command_line import begin_process, chosen_scenario, options, run_command
+from bridge.command_line import DurationNs, begin_process, chosen_scenario, options, run_command
 from bridge.summary import show_json
 from protocol import errors
 from protocol.errors import FwavHilError, ScenarioError
@@ -233,3 +233,23 @@ class TestBeginProcess:
             "started with 127.0.0.1:5",
             "ended; sent 3, bad_crc 2",
         ]
+
+
+class TestDuration:
+    @pytest.mark.parametrize(
+        ("text", "expected_ns"),
+        [("5ms", 5_000_000), ("250us", 250_000), ("0.1s", 100_000_000), (".5ms", 500_000), ("7ns", 7), ("0s", 0),
+         ("1.5us", 1500), (" 1s ", 1_000_000_000), ("1.s", 1_000_000_000)],
+    )  # fmt: skip
+    def test_a_number_and_its_unit(self, text: str, expected_ns: int) -> None:
+        assert DurationNs().convert(text, None, None) == expected_ns
+
+    @pytest.mark.parametrize("text", ["", "5", "ms", "-5ms", "5 ms", "5min", "nans", "1e-3s", "5msx", "five ms", "٥ms"])
+    def test_anything_else_names_the_remedy(self, text: str) -> None:
+        with pytest.raises(click.BadParameter, match="5ms, 250us"):
+            DurationNs().convert(text, None, None)
+
+    @pytest.mark.parametrize("text", ["1.001s", "1001ms", "9" * 400 + "s"])
+    def test_more_than_a_second_is_refused(self, text: str) -> None:
+        with pytest.raises(click.BadParameter, match="more than a second"):
+            DurationNs().convert(text, None, None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import select
 import signal
 import socket
+import sys
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -302,3 +303,63 @@ def test_a_signal_handler_that_raises_ends_the_wait(out_end: UdpOut) -> None:
             out_end.recv(10.0)
     finally:
         signal.signal(signal.SIGALRM, previous)
+
+
+class TestStamps:
+    @pytest.mark.skipif(sys.platform != "linux", reason="NOT TESTED: kernel receive stamps are asked for on Linux only")
+    @pytest.mark.parametrize("spin_s", [0.0, 0.05], ids=["sleeping", "polling"])
+    def test_the_kernel_says_when_a_datagram_came_however_late_it_is_fetched(
+        self, in_end: UdpIn, out_end: UdpOut, spin_s: float
+    ) -> None:
+        clock = MonotonicClock()
+        introduce(out_end, in_end)
+        for sender, receiver in ((out_end, in_end), (in_end, out_end)):
+            assert receiver.stamp_receives()
+            receiver.spin_s = spin_s
+            before_ns = clock.now_ns()
+            sender.send(b"early")
+            sent_ns = clock.now_ns()
+            clock.sleep_until_ns(sent_ns + 30_000_000)
+            assert receive(receiver) == b"early"
+            # Generous: the two clocks are read one after the other, and on loopback to send is to receive.
+            assert before_ns - 100_000 <= receiver.received_ns <= sent_ns + 5_000_000
+
+    def test_without_being_asked_for_they_are_unknown(self, in_end: UdpIn, out_end: UdpOut) -> None:
+        introduce(out_end, in_end)
+        assert in_end.received_ns == 0
+
+    @pytest.mark.skipif(sys.platform != "linux", reason="NOT TESTED: kernel receive stamps are asked for on Linux only")
+    def test_strangers_are_dropped_and_their_stamps_with_them(self, in_end: UdpIn, out_end: UdpOut) -> None:
+        introduce(out_end, in_end)
+        assert in_end.stamp_receives()
+        with open_out(in_end.port) as stranger:
+            out_end.send(b"mine")
+            clock = MonotonicClock()
+            after_ns = clock.now_ns()
+            clock.sleep_until_ns(after_ns + 20_000_000)
+            stranger.send(b"noise")
+            assert receive(in_end) == b"mine"
+            assert in_end.received_ns <= after_ns + 10_000_000
+            assert in_end.recv(0.002) is None
+            assert in_end.stats.unknown_peer == 1
+
+    def test_nobody_there_is_counted_with_stamps_too(self, in_end: UdpIn, out_end: UdpOut) -> None:
+        out_end.stamp_receives()
+        in_end.close()
+        out_end.send(b"anyone?")
+        wait_for_answer(out_end)
+        assert out_end.recv(0) is None
+        assert out_end.stats.refused == 1
+
+    def test_a_system_that_refuses_them_is_no_error(self, out_end: UdpOut, monkeypatch: pytest.MonkeyPatch) -> None:
+        class Refusing:
+            def setsockopt(self, *_: object) -> None:
+                raise OSError(92, "Protocol not available")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(out_end, "_socket", Refusing())
+            assert not out_end.stamp_receives()
+
+    def test_elsewhere_they_are_not_asked_for(self, out_end: UdpOut, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(sys, "platform", "darwin")
+        assert not out_end.stamp_receives()
