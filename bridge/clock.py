@@ -20,6 +20,10 @@ class Clock(abc.ABC):
     def sleep_until_ns(self, t_ns: int) -> None:
         """Return when `now_ns` has reached t_ns, or a little later."""
 
+    @abc.abstractmethod
+    def spin_until_ns(self, t_ns: int) -> None:
+        """The same without letting go of the core: exact, and as dear as work."""
+
 
 class MonotonicClock(Clock):
     """The machine's CLOCK_MONOTONIC."""
@@ -33,6 +37,12 @@ class MonotonicClock(Clock):
         remaining_ns = t_ns - time.monotonic_ns()
         if remaining_ns > 0:
             time.sleep(remaining_ns * 1e-9)
+
+    def spin_until_ns(self, t_ns: int) -> None:
+        """Ask for the time again and again."""
+        now_ns = time.monotonic_ns
+        while now_ns() < t_ns:
+            pass
 
 
 class VirtualClock(Clock):
@@ -48,6 +58,10 @@ class VirtualClock(Clock):
     def sleep_until_ns(self, t_ns: int) -> None:
         """Jump to t_ns, never back."""
         self._t_ns = max(self._t_ns, t_ns)
+
+    def spin_until_ns(self, t_ns: int) -> None:
+        """Jump to t_ns, never back."""
+        self.sleep_until_ns(t_ns)
 
     def advance_ns(self, step_ns: int) -> None:
         """Move on by step_ns."""
