@@ -83,7 +83,9 @@ class Machine:
             return Finding("kernel preemption", found, False, "boot with preempt=full, or a kernel with PREEMPT_RT")
         if "PREEMPT" in version:
             return Finding("kernel preemption", f"{release}, PREEMPT", True)
-        return Finding("kernel preemption", f"{release}, none or voluntary", False, "sudo apt install linux-image-rt-amd64")
+        return Finding(
+            "kernel preemption", f"{release}, none or voluntary", False, "sudo apt install linux-image-rt-amd64"
+        )
 
     def priority(self) -> Finding:
         """Whether this user may have SCHED_FIFO."""
@@ -96,7 +98,10 @@ class Machine:
 
     def throttling(self) -> Finding:
         """The share of a core that real-time processes may take before the kernel makes room for others."""
-        runtime, period = self._read("proc/sys/kernel/sched_rt_runtime_us"), self._read("proc/sys/kernel/sched_rt_period_us")
+        runtime, period = (
+            self._read("proc/sys/kernel/sched_rt_runtime_us"),
+            self._read("proc/sys/kernel/sched_rt_period_us"),
+        )
         if not runtime.lstrip("-").isdigit() or not period.isdigit():
             return Finding("real-time throttling", _NOT_TOLD, None)
         if int(runtime) < 0:
@@ -147,7 +152,9 @@ class Machine:
         if not names:
             return Finding("frequency governor", _NOT_TOLD, None)
         good = names == ["performance"]
-        return Finding("frequency governor", ", ".join(names), good, "" if good else "sudo cpupower frequency-set -g performance")
+        return Finding(
+            "frequency governor", ", ".join(names), good, "" if good else "sudo cpupower frequency-set -g performance"
+        )
 
     def timer_slack(self) -> Finding:
         """By how much the system may stretch a sleep; `--realtime` sets it to 1 ns for itself."""
@@ -195,4 +202,6 @@ class Machine:
         words = self._read("proc/stat").splitlines()[:1]
         times = [int(word) for word in words[0].split()[1:9]] if words else []
         stolen = f", {100 * times[7] / max(1, sum(times)):.2g} % stolen since it started" if len(times) == 8 else ""
-        return Finding("virtual machine", f"yes{stolen}", None, "no command mends what the host takes: use a machine without one")
+        return Finding(
+            "virtual machine", f"yes{stolen}", None, "no command mends what the host takes: use a machine without one"
+        )

@@ -23,6 +23,7 @@ from bridge.command_line import (
     trigger_option,
     wait_option,
 )
+from bridge.link import refuse_rate_that_cannot_fit
 from bridge.realtime import check_real_time, own_core
 from bridge.summary import show_json
 
@@ -79,6 +80,8 @@ def controller(
     """Run the controller alone: it looks for an emulator, then answers each of its samples with the law of SCENARIO."""
     chosen = chosen_scenario(scenario, rate_hz=rate, law=law)
     check_real_time(clock, realtime=realtime, trigger=trigger)
+    if clock == "realtime":
+        refuse_rate_that_cannot_fit(link, chosen.rate_hz)
     report, stop = begin_process(status, core, with_parent=with_parent)
     from controller.process import ControllerOptions, run_controller
 

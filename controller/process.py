@@ -358,7 +358,9 @@ def serve(
     with maybe_real_time(options.core, wanted=options.realtime) as settings:
         report_settings(report, settings)
         lockstep = options.clock == "lockstep"
-        spin_ns = choose_spin_ns(clock, law.period_ns, 0.0 if lockstep else options.spin_s, measure=has_own_core(settings))
+        spin_ns = choose_spin_ns(
+            clock, law.period_ns, 0.0 if lockstep else options.spin_s, measure=has_own_core(settings)
+        )
         controller = Controller(scenario, law, link, options, clock, stop, spin_ns)
         try:
             controller.run()

@@ -141,6 +141,7 @@ def run_command(
 ) -> None:
     """Fly SCENARIO with the emulator and the controller as two processes that speak MAVLink over a link."""
     chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
+    from bridge.link import refuse_rate_that_cannot_fit
     from bridge.realtime import check_real_time
     from controller.laws import make_law
     from fwav_hil.compile import compile_kernels
@@ -152,6 +153,8 @@ def run_command(
         raise UsageError(chosen_law.velocity_sentence())
     check_real_time(clock, realtime=realtime, trigger=trigger)
     check_link(link)
+    if clock == "realtime":
+        refuse_rate_that_cannot_fit(link, chosen.rate_hz)
     if clock != "realtime" and (delay_ns or legs):
         raise UsageError(
             "--delay and --legs are of real time: add --clock realtime (in lockstep the scenario's [delay] is)"

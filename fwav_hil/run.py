@@ -143,7 +143,9 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
         common.append("--legs")
     emulator = Child("plant_emulator", [*common, *placement.emulator, "--link", f"{scheme}://{address}", *own])
     # The controller learns its link when the emulator has opened its own: were the port another run's, it must not go there.
-    controller = Child("controller", [*common, *placement.controller, "--link", "-", "--arm", "--trigger", options.trigger])
+    controller = Child(
+        "controller", [*common, *placement.controller, "--link", "-", "--arm", "--trigger", options.trigger]
+    )
     try:
         _watch(scenario, emulator, controller, stop, Progress(scenario.duration_s) if options.show_progress else None)
     finally:

@@ -24,6 +24,7 @@ from bridge.command_line import (
     spin_option,
     wait_option,
 )
+from bridge.link import refuse_rate_that_cannot_fit
 from bridge.realtime import check_real_time, own_core
 from bridge.summary import show_json
 
@@ -83,6 +84,8 @@ def emulator(
     """Run the plant emulator alone: it waits for a controller, then flies SCENARIO (a file or a name) with it."""
     chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed)
     check_real_time(clock, realtime=realtime)
+    if clock == "realtime" or speed:
+        refuse_rate_that_cannot_fit(link, chosen.rate_hz * (1.0 if clock == "realtime" else speed or 1.0))
     report, stop = begin_process(status, core, with_parent=with_parent)
     from plant_emulator.process import EmulatorOptions, run_emulator
 
