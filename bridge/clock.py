@@ -68,6 +68,11 @@ class VirtualClock(Clock):
         self._t_ns += step_ns
 
 
+def processor_time_ns() -> int:
+    """What this process has used of all cores so far, ns."""
+    return time.process_time_ns()
+
+
 def unix_time_us() -> int:
     """Microseconds since 1970, for the stamps of a log written in real time."""
     return time.time_ns() // 1000

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bridge.clock import Clock, MonotonicClock
+from bridge.clock import Clock, MonotonicClock, processor_time_ns
 from bridge.endpoint import VEHICLE, Endpoint
 from bridge.legs import CONTROLLER_FILE, SAMPLE_COLUMNS, LegTable, save_legs
 from bridge.link import Link
@@ -111,11 +111,13 @@ class Controller:
         self.legs = LegTable(SAMPLE_COLUMNS) if options.legs else None
         self._woke_ns = 0
         self._came_ns = (0, 0)
+        self._run_began_ns = clock.now_ns(), processor_time_ns()
         self.counters = {"late_samples": 0, "reused_samples": 0, "skipped_samples": 0}
 
     def run(self) -> None:
         """Meet the emulator, then answer its samples until it says that the run is over."""
         self._meet()
+        self._run_began_ns = self.clock.now_ns(), processor_time_ns()
         read: Callable[[], PositionSample | None] = self._read
         if self.keeper:
             self.keeper.resume()  # where in the emulator's period this clock ticks is chance, as between two machines
@@ -288,6 +290,11 @@ class Controller:
         armed = self._was_armed and self.vehicle.armed and not self._samples
         self._quick.get_ready(self.actuation.answered_ns, self.actuation.quiet_until_ns if armed else 0)
 
+    def processor_share(self) -> float:
+        """The share of a core that the run has taken since its first sample."""
+        wall_ns, processor_ns = self._run_began_ns
+        return (processor_time_ns() - processor_ns) / max(1, self.clock.now_ns() - wall_ns)
+
     def summary(self) -> dict[str, int]:
         """Everything counted at this end, by name."""
         return {
@@ -366,12 +373,14 @@ def serve(
             controller.run()
         except FwavHilError as stopped:
             error = stopped
+        processor_share = controller.processor_share()
     summary = {
         "law": law.name,
         "trigger": options.trigger,
         "lateness_us": controller.keeper.summary() if controller.keeper else None,
         "spin_us": spin_ns / 1e3,
         "realtime": settings,
+        "processor_share": processor_share,
         "counters": controller.summary(),
         "error": str(error) if error else None,
     }

@@ -67,6 +67,10 @@ def summarise(folder: Path, *, placement: str = "") -> dict[str, Any]:
         "trigger": controller.get("trigger"),
         "lateness_us": {"emulator": emulator.get("lateness_us"), "controller": controller.get("lateness_us")},
         "realtime": {"emulator": emulator.get("realtime") or [], "controller": controller.get("realtime") or []},
+        "processor_share": {
+            "emulator": emulator.get("processor_share"),
+            "controller": controller.get("processor_share"),
+        },
         "counters": {
             "missed": ends["controller"].get("missed_samples", 0) + ends["emulator"].get("unanswered", 0),
             "late": _total(ends, ("late", "late_samples")),

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bridge.clock import Clock, MonotonicClock
+from bridge.clock import Clock, MonotonicClock, processor_time_ns
 from bridge.endpoint import VEHICLE, Endpoint, refuse_other_scenario
 from bridge.faults import DelayedLink
 from bridge.legs import ANSWER_COLUMNS, EMULATOR_FILE, TICK_COLUMNS, LegTable, save_legs
@@ -180,7 +180,7 @@ def _run_ticks(
     scenario: Scenario, emulator: Emulator, pacing: Pacing, out: Path | None, report: Report, settings: Settings
 ) -> dict[str, Any]:
     period_ns, clock = scenario.period_ns, pacing.clock
-    begun_ns = clock.now_ns()
+    begun_ns, processor_ns = clock.now_ns(), processor_time_ns()
     next_progress_ns = last_ns = begun_ns
     ticks_ns: list[int] = []
     done = 0
@@ -201,6 +201,7 @@ def _run_ticks(
     except FwavHilError as stopped:
         error = stopped
     wall_ns = clock.now_ns() - begun_ns
+    processor_ns = processor_time_ns() - processor_ns
     _say_farewell(emulator, pacing, done * period_ns)
     summary = {
         "clock": "realtime" if isinstance(pacing, RealTime) else "lockstep",
@@ -210,6 +211,7 @@ def _run_ticks(
         "tick_us": percentiles_us(ticks_ns),
         "lateness_us": pacing.keeper.summary() if pacing.keeper else None,
         "realtime": settings,
+        "processor_share": processor_ns / max(1, wall_ns),
         "counters": {**emulator.all_counters(), **pacing.counters},
         "error": str(error) if error else None,
     }
