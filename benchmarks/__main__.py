@@ -5,6 +5,7 @@ Machines are shared and noisy, so each figure is the best of three alternations 
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import platform
@@ -12,10 +13,15 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from benchmarks.codec import codec
 from benchmarks.ping_pong import round_trip_us
+from benchmarks.processor import processor_time
+from benchmarks.start import start
+from benchmarks.wake_up import wake_up_lateness
 from fwav_hil.compile import compile_kernels
 from fwav_hil.simulate import simulate
 from protocol.scenario import find_scenario, load_scenario, with_overrides
@@ -69,10 +75,28 @@ def _row(value: float, unit: str, anchor: str, anchor_value: float, bar: str, ok
     }
 
 
+BENCHMARKS: dict[str, Callable[[argparse.Namespace], dict[str, dict[str, Any]]]] = {
+    "lockstep_tick": lambda _given: {"lockstep_tick": lockstep_tick()},
+    "wake_up": lambda given: wake_up_lateness(given.wake_up_seconds),
+    "codec": lambda _given: codec(),
+    "simulated_steps": lambda _given: {"simulated_steps": simulated_steps()},
+    "processor": lambda _given: processor_time(),
+    "start": lambda _given: start(),
+}
+"""By the name one calls it with: what it gives, by the names of its rows."""
+
+
 def main() -> None:
     """Run all, print and write."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Benchmarks; without names, all of them.")
+    parser.add_argument("names", nargs="*", choices=[*BENCHMARKS, []], metavar="NAME", help=", ".join(BENCHMARKS))
+    parser.add_argument("--wake-up-seconds", type=float, default=10.0, help="length of a turn of wake_up (default 10)")
+    given = parser.parse_args()
     compile_kernels(load_scenario(find_scenario("paper")))
-    results = {"lockstep_tick": lockstep_tick(), "simulated_steps": simulated_steps()}
+    written = HERE / "results.json"
+    results: dict[str, dict[str, Any]] = json.loads(written.read_text()) if given.names else {}
+    for name in given.names or BENCHMARKS:
+        results |= BENCHMARKS[name](given)
     lines = [
         "# Benchmarks",
         "",
@@ -85,11 +109,16 @@ def main() -> None:
     for name, row in results.items():
         lines.append(
             f"| {name} | {row['value']:.4g} {row['unit']} | {row['anchor']}: {row['anchor_value']:.4g} | "
-            f"{row['ratio']:.3g} | {row['bar']} | {'yes' if row['ok'] else 'no'} |"
+            f"{_shown(row['ratio'])} | {row['bar']} | {'yes' if row['ok'] else 'no'} |"
         )
+    lines += ["", *(f"- {name}: {row['note']}." for name, row in results.items() if row.get("note"))]
     print("\n".join(lines))
     (HERE / "RESULTS.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     (HERE / "results.json").write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+
+
+def _shown(ratio: float | None) -> str:
+    return "-" if ratio is None else f"{ratio:.3g}"
 
 
 if __name__ == "__main__":

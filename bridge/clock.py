@@ -26,6 +26,10 @@ class Clock(abc.ABC):
     def sleep_until_ns(self, t_ns: int) -> None:
         """Return when `now_ns` has reached t_ns, or a little later."""
 
+    @abc.abstractmethod
+    def spin_until_ns(self, t_ns: int) -> None:
+        """The same without letting go of the core: exact, and as dear as work."""
+
 
 class MonotonicClock(Clock):
     """The machine's CLOCK_MONOTONIC."""
@@ -39,6 +43,12 @@ class MonotonicClock(Clock):
         remaining_ns = t_ns - time.monotonic_ns()
         if remaining_ns > 0:
             time.sleep(remaining_ns * 1e-9)
+
+    def spin_until_ns(self, t_ns: int) -> None:
+        """Ask for the time again and again."""
+        now_ns = time.monotonic_ns
+        while now_ns() < t_ns:
+            pass
 
 
 class PunctualClock(MonotonicClock):
@@ -77,9 +87,18 @@ class VirtualClock(Clock):
         """Jump to t_ns, never back."""
         self._t_ns = max(self._t_ns, t_ns)
 
+    def spin_until_ns(self, t_ns: int) -> None:
+        """Jump to t_ns, never back."""
+        self.sleep_until_ns(t_ns)
+
     def advance_ns(self, step_ns: int) -> None:
         """Move on by step_ns."""
         self._t_ns += step_ns
+
+
+def processor_time_ns() -> int:
+    """What this process has used of all cores so far, ns."""
+    return time.process_time_ns()
 
 
 def unix_time_us() -> int:

@@ -88,11 +88,25 @@ legs_option = click.option(
     "--legs", is_flag=True,
     help="Real time: note when each sample and command was where, in the run folder; see `fwav-hil latency`.",
 )  # fmt: skip
+realtime_option = click.option(
+    "--realtime", is_flag=True,
+    help="With --clock realtime: ask for SCHED_FIFO, locked memory, a core of its own, no deep idle states, timer slack "
+    "1 ns, no garbage collection, and poll the end of each wait; what the system refuses is said.",
+)  # fmt: skip
+trigger_option = click.option(
+    "--trigger", type=click.Choice(["sample", "clock"]), default="sample", show_default=True,
+    help="With --clock realtime the controller steps on each sample as it comes, or on a clock of its own with the "
+    "newest one.",
+)  # fmt: skip
+spin_option = click.option(
+    "--spin-us", type=click.IntRange(min=0), metavar="US",
+    help="Poll this long instead of what is measured at the start: in real time before each deadline, in lockstep for "
+    "each answer.",
+)  # fmt: skip
 
 process_options = options(
     click.option("--status", type=click.Choice(["text", "jsonl"]), default="text", hidden=True),
     click.option("--core", type=int, hidden=True),
-    click.option("--spin-us", type=click.IntRange(min=0), default=0, hidden=True),
     click.option("--with-parent", is_flag=True, hidden=True),
 )
 
@@ -117,6 +131,11 @@ def _report_text(event: dict[str, Any]) -> None:
     kind = event["event"]
     if kind == "waiting":
         click.echo(f"waiting on {event['link']}", err=True)
+    elif kind == "realtime":
+        for setting in event["settings"]:
+            remedy = f" (mend: {setting.remedy})" if setting.remedy else ""
+            what = "granted" if setting.granted else "refused"
+            click.echo(f"real time: {setting.name} {what}: {setting.said}{remedy}", err=True)
     elif kind == "started":
         click.echo(f"started with {event['peer']}", err=True)
     elif kind == "warning":

@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 from types import MappingProxyType
 from typing import Final, Protocol, Self, cast
 
-from protocol.errors import LinkClosedError, LinkError, LinkUriError
+from protocol.errors import LinkClosedError, LinkError, LinkUriError, UsageError
 
 NOBODY: Final = "nobody yet"
 """What `Link.peer` says before there is a peer."""
@@ -188,6 +188,16 @@ def open_link(uri: str, *, connect_timeout_s: float = 10.0) -> Link:
     module, _, name = LINKS[parsed.scheme].partition(":")
     opener = cast(_Opener, getattr(importlib.import_module(module), name))
     return opener(parsed, connect_timeout_s=connect_timeout_s)
+
+
+def refuse_rate_that_cannot_fit(uri: str, rate_hz: float) -> None:
+    """Raise UsageError where a serial line cannot carry the contract at a rate; other links are not looked at."""
+    if uri.startswith("serial://"):
+        from bridge.budget import link_budget
+
+        budget = link_budget(uri, rate_hz)
+        if not budget.fits:
+            raise UsageError(budget.sentence)
 
 
 def parse_link_uri(text: str) -> LinkUri:

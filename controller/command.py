@@ -17,9 +17,14 @@ from bridge.command_line import (
     options,
     process_options,
     rate_option,
+    realtime_option,
     scenario_argument,
+    spin_option,
+    trigger_option,
     wait_option,
 )
+from bridge.link import refuse_rate_that_cannot_fit
+from bridge.realtime import check_real_time, own_core
 from bridge.summary import show_json
 
 EXAMPLE = """
@@ -38,6 +43,9 @@ Example:
     ),
     law_option,
     clock_option,
+    realtime_option,
+    trigger_option,
+    spin_option,
     rate_option,
     click.option(
         "--arm/--no-arm", default=True, show_default=True,
@@ -56,6 +64,9 @@ def controller(
     link: str,
     law: str | None,
     clock: str,
+    realtime: bool,
+    trigger: str,
+    spin_us: int | None,
     rate: float | None,
     arm: bool,
     legs: bool,
@@ -64,16 +75,19 @@ def controller(
     json_path: Path | None,
     status: str,
     core: int | None,
-    spin_us: int,
     with_parent: bool,
 ) -> None:
     """Run the controller alone: it looks for an emulator, then answers each of its samples with the law of SCENARIO."""
     chosen = chosen_scenario(scenario, rate_hz=rate, law=law)
+    check_real_time(clock, realtime=realtime, trigger=trigger)
+    if clock == "realtime":
+        refuse_rate_that_cannot_fit(link, chosen.rate_hz)
     report, stop = begin_process(status, core, with_parent=with_parent)
     from controller.process import ControllerOptions, run_controller
 
     run_options = ControllerOptions(
-        link=link, clock=clock, arm=arm, out=out, wait_s=wait_s, spin_s=spin_us * 1e-6, legs=legs
-    )
+        link=link, clock=clock, arm=arm, out=out, wait_s=wait_s, spin_s=None if spin_us is None else spin_us * 1e-6,
+        trigger=trigger, realtime=realtime, core=own_core(1) if core is None else core, legs=legs,
+    )  # fmt: skip
     summary = run_controller(chosen, run_options, report, stop)
     show_json(json_path, {"scenario": chosen.name, "rate_hz": chosen.rate_hz, **summary})

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from bridge.clock import Clock, MonotonicClock
+from bridge.clock import Clock, MonotonicClock, processor_time_ns
 from bridge.endpoint import VEHICLE, Endpoint
 from bridge.legs import CONTROLLER_FILE, SAMPLE_COLUMNS, LegTable, save_legs
 from bridge.link import Link
 from bridge.memory import memory_pair
 from bridge.process import Report, StopFlag, open_patiently
+from bridge.rate import RateKeeper, choose_spin_ns
+from bridge.realtime import has_own_core, maybe_real_time, report_settings
 from bridge.summary import make_folder, write_json
 from bridge.timesync import TimeSync
 from controller.actuation import HilActuation
@@ -41,7 +45,9 @@ class ControllerOptions(msgspec.Struct, frozen=True, kw_only=True):
     """How the process runs.
 
     link: a URI, or `-` to read it from standard input once everything is ready. legs: real time: note when each sample
-    and command was where.
+    and command was where. trigger: in real time, `sample` or `clock`. realtime, core: ask for what `bridge.realtime` lists.
+    spin_s: in lockstep see `Link.spin_s` (None: 0); in real time how long to poll before a sample or deadline is due (None:
+    as measured with `realtime`, else 0).
     """
 
     link: str
@@ -49,8 +55,11 @@ class ControllerOptions(msgspec.Struct, frozen=True, kw_only=True):
     arm: bool = True
     out: Path | None = None
     wait_s: float = 30.0
-    spin_s: float = 0.0
+    spin_s: float | None = None
     legs: bool = False
+    trigger: str = "sample"
+    realtime: bool = False
+    core: int | None = None
 
 
 class Controller:
@@ -59,11 +68,21 @@ class Controller:
     The law's period is the scenario's, whatever the emulator's is: periods without a sample are made up for, and a sample
     that comes before its period is over is answered with the command that stands.
 
-    counters   late_samples  real time: periods in which no sample came in time
+    keeper     of its own clock, with trigger `clock`
+    counters   late_samples     real time: periods in which no sample came in time
+               reused_samples   trigger clock: steps for which no new sample was there, so that the last command stood
+               skipped_samples  trigger clock: samples of which a newer one was there by the time of the step
     """
 
     def __init__(
-        self, scenario: Scenario, law: Law, link: Link, options: ControllerOptions, clock: Clock, stop: StopFlag
+        self,
+        scenario: Scenario,
+        law: Law,
+        link: Link,
+        options: ControllerOptions,
+        clock: Clock,
+        stop: StopFlag,
+        spin_ns: int = 0,
     ) -> None:
         component = scenario.wire.emulator_component
         self.law = law
@@ -82,18 +101,28 @@ class Controller:
         self._patience_s = LOOK_PERIOD_S if lockstep else PATIENCE_PERIODS * scenario.period_ns * 1e-9
         self._period_s = self._patience_s if lockstep else scenario.period_ns * 1e-9
         self._lockstep = lockstep
+        self._spin_ns = spin_ns
+        self._due_ns = 0
+        self.keeper = RateKeeper(clock, scenario.period_ns, spin_ns) if options.trigger == "clock" else None
         self._samples: deque[PositionSample] = deque()
         self._silence_ns = 0
         self._begun = self._was_armed = False
         self.time_sync = TimeSync(self.endpoint, clock)
         self.legs = LegTable(SAMPLE_COLUMNS) if options.legs else None
         self._woke_ns = 0
-        self.counters = {"late_samples": 0}
+        self._came_ns = (0, 0)
+        self._run_began_ns = clock.now_ns(), processor_time_ns()
+        self.counters = {"late_samples": 0, "reused_samples": 0, "skipped_samples": 0}
 
     def run(self) -> None:
-        """Meet the emulator, then answer every sample until it says that the run is over."""
+        """Meet the emulator, then answer its samples until it says that the run is over."""
         self._meet()
-        while (sample := self._read()) or not self.vehicle.ended:
+        self._run_began_ns = self.clock.now_ns(), processor_time_ns()
+        read: Callable[[], PositionSample | None] = self._read
+        if self.keeper:
+            self.keeper.resume()  # where in the emulator's period this clock ticks is chance, as between two machines
+            read = functools.partial(self._read_by_clock, self.keeper)
+        while (sample := read()) or not self.vehicle.ended:
             if sample is None or sample.t_ns == self.actuation.answered_ns:
                 self.actuation.repeat()
                 continue
@@ -133,23 +162,70 @@ class Controller:
         while not self._samples and not self.vehicle.ended:
             self.stop.check()
             begun_ns = self.clock.now_ns()
-            if not self._lockstep and self._begun and begun_ns >= self.time_sync.next_ns:
-                self.endpoint.send([self.time_sync.question()])
+            self._ask_the_time(begun_ns)
             # Once a sample is late, the command that stands is given again each period.
-            if self._look(self._period_s if self._silence_ns else self._patience_s):
+            if self._await(self._period_s if self._silence_ns else self._patience_s):
                 self._silence_ns = 0
                 continue
-            # Waits are added up one by one: a stall of the whole machine then counts as one wait, not as silence.
-            self._silence_ns += min(self.clock.now_ns() - begun_ns, round(2e9 * self._patience_s))
-            if self._silence_ns > HEARTBEAT_TIMEOUT_NS:
-                raise PeerLostError(
-                    f"the emulator at {self.endpoint.link.uri} fell silent for 3 s after t = "
-                    f"{self.actuation.answered_ns * 1e-9:.3f} s: see whether it still runs"
-                )
+            self._count_silence(begun_ns)
             if not self._lockstep:
                 self.counters["late_samples"] += 1
                 return None
         return self._samples.popleft() if self._samples else None
+
+    def _read_by_clock(self, keeper: RateKeeper) -> PositionSample | None:
+        """The newest sample at the next deadline of this end's own clock; None where the run is over or none is new."""
+        heard = False
+        begun_ns = self.clock.now_ns()
+        while not self.vehicle.ended and (wait_s := keeper.remaining_s()) is not None:
+            self.stop.check()
+            self._ask_the_time(begun_ns)
+            heard = self._look(wait_s) or heard
+        if heard:
+            self._silence_ns = 0
+        else:
+            self._count_silence(begun_ns)
+        if self.vehicle.ended:
+            return None
+        keeper.tick()
+        new = {sample.t_ns: sample for sample in self._samples if sample.t_ns > self.actuation.answered_ns}
+        self._samples.clear()
+        if not new:
+            self.counters["reused_samples"] += 1
+            return None
+        self.counters["skipped_samples"] += len(new) - 1
+        return new[max(new)]
+
+    def _ask_the_time(self, now_ns: int) -> None:
+        """Send a TIMESYNC, in real time, when one is due."""
+        if not self._lockstep and self._begun and now_ns >= self.time_sync.next_ns:
+            self.endpoint.send([self.time_sync.question()])
+
+    def _count_silence(self, begun_ns: int) -> None:
+        """Add up a wait in which nothing came. Raises PeerLostError after 3 s of them.
+
+        One by one: a stall of the whole machine then counts as one wait, not as silence.
+        """
+        self._silence_ns += min(self.clock.now_ns() - begun_ns, round(2e9 * self._patience_s))
+        if self._silence_ns > HEARTBEAT_TIMEOUT_NS:
+            raise PeerLostError(
+                f"the emulator at {self.endpoint.link.uri} fell silent for 3 s after t = "
+                f"{self.actuation.answered_ns * 1e-9:.3f} s: see whether it still runs"
+            )
+
+    def _await(self, timeout_s: float) -> bool:
+        """`_look`, polling around the time at which the next sample is due."""
+        if not self._spin_ns or self._lockstep:
+            return self._look(timeout_s)
+        now_ns = self.clock.now_ns()
+        end_ns = now_ns + round(timeout_s * 1e9)
+        sleep_ns = self._due_ns - self._spin_ns - now_ns
+        if 0 < sleep_ns < end_ns - now_ns and self._look(sleep_ns * 1e-9):
+            return True
+        while self.clock.now_ns() < self._due_ns + self._spin_ns:
+            if self._look(0.0):
+                return True
+        return self._look(max(0, end_ns - self.clock.now_ns()) * 1e-9)
 
     def _look(self, timeout_s: float) -> bool:
         """Take what comes within the timeout; whether anything came."""
@@ -165,7 +241,7 @@ class Controller:
             return False
         if not self._lockstep:
             self._woke_ns = self.clock.now_ns()
-        if self._answer_at_once(data):
+        if self.keeper is None and self._answer_at_once(data):
             return True
         for frame in self.endpoint.reader.read(data):
             if self.telemetry.is_telemetry(frame):
@@ -175,6 +251,7 @@ class Controller:
                         self._begun = True
                         self.endpoint.reader.restart_sequences([(frame.system, frame.component, frame.sequence + 1)])
                     self._samples.append(sample)
+                    self._note_arrival()
             elif frame.message_id == mavlink_map.TIMESYNC.message_id and not self._lockstep:
                 answer = self.time_sync.take(frame, self.endpoint.link.received_ns or self._woke_ns)
                 if answer:
@@ -189,6 +266,7 @@ class Controller:
         t_ns, answer = self._quick.to(data)
         if t_ns < 0:
             return False
+        self._note_arrival()
         computed_ns = self.clock.now_ns() if self.legs else 0
         self.actuation.send(t_ns, answer)
         self._note(t_ns, computed_ns)
@@ -196,15 +274,26 @@ class Controller:
         self._get_ready()
         return True
 
+    def _note_arrival(self) -> None:
+        """Note when the sample just read came, and so when the next one is due."""
+        self._due_ns = self._woke_ns + self.law.period_ns
+        if self.legs:
+            self._came_ns = (self.endpoint.link.received_ns, self._woke_ns)
+
     def _note(self, t_ns: int, computed_ns: int) -> None:
         """Note when the sample of t_ns and its command, just sent, were where."""
         if self.legs:
-            self.legs.add(t_ns, self.endpoint.link.received_ns, self._woke_ns, computed_ns, self.actuation.sent_ns)
+            self.legs.add(t_ns, *self._came_ns, computed_ns, self.actuation.sent_ns)
 
     def _get_ready(self) -> None:
         """Say which samples may be answered at once: those after the last one, while armed and nothing else is due."""
         armed = self._was_armed and self.vehicle.armed and not self._samples
         self._quick.get_ready(self.actuation.answered_ns, self.actuation.quiet_until_ns if armed else 0)
+
+    def processor_share(self) -> float:
+        """The share of a core that the run has taken since its first sample."""
+        wall_ns, processor_ns = self._run_began_ns
+        return (processor_time_ns() - processor_ns) / max(1, self.clock.now_ns() - wall_ns)
 
     def summary(self) -> dict[str, int]:
         """Everything counted at this end, by name."""
@@ -214,6 +303,7 @@ class Controller:
             **self.actuation.counters,
             **self.law.counts(self.state),
             **self.counters,
+            **(self.keeper.counters if self.keeper else {}),
         }
 
 
@@ -248,7 +338,8 @@ def run_controller(scenario: Scenario, options: ControllerOptions, report: Repor
     uri = _told_link() if options.link == "-" else options.link
     report({"event": "waiting", "link": uri})
     with open_patiently(uri, options.wait_s, stop) as link:
-        link.spin_s = options.spin_s
+        if options.clock == "lockstep":
+            link.spin_s = options.spin_s or 0.0
         if options.legs:
             link.stamp_receives()
         return serve(scenario, law, link, options, report, stop)
@@ -269,13 +360,30 @@ def serve(
 
     Raises the errors of `protocol.errors`, after the summary is written.
     """
-    controller = Controller(scenario, law, link, options, MonotonicClock(), stop)
+    clock = MonotonicClock()
     error: FwavHilError | None = None
-    try:
-        controller.run()
-    except FwavHilError as stopped:
-        error = stopped
-    summary = {"law": law.name, "counters": controller.summary(), "error": str(error) if error else None}
+    with maybe_real_time(options.core, wanted=options.realtime) as settings:
+        report_settings(report, settings)
+        lockstep = options.clock == "lockstep"
+        spin_ns = choose_spin_ns(
+            clock, law.period_ns, 0.0 if lockstep else options.spin_s, measure=has_own_core(settings)
+        )
+        controller = Controller(scenario, law, link, options, clock, stop, spin_ns)
+        try:
+            controller.run()
+        except FwavHilError as stopped:
+            error = stopped
+        processor_share = controller.processor_share()
+    summary = {
+        "law": law.name,
+        "trigger": options.trigger,
+        "lateness_us": controller.keeper.summary() if controller.keeper else None,
+        "spin_us": spin_ns / 1e3,
+        "realtime": settings,
+        "processor_share": processor_share,
+        "counters": controller.summary(),
+        "error": str(error) if error else None,
+    }
     if options.out:
         make_folder(options.out)
         write_json(options.out / "controller.json", summary)

@@ -23,8 +23,11 @@ from bridge.command_line import (
     log_error_option,
     options,
     rate_option,
+    realtime_option,
     scenario_argument,
     seed_option,
+    spin_option,
+    trigger_option,
     wait_option,
 )
 from bridge.summary import is_stdout, show_json
@@ -46,6 +49,8 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
             "Replay a log: to a link, into a controller, into the plant.",
         ),
         "diff": ("fwav_hil.replay.diff_command:diff_command", "Compare two logs, sample by sample."),
+        "doctor": ("fwav_hil.doctor_command:doctor", "Say what this machine can promise in real time."),
+        "budget": ("fwav_hil.budget_command:budget", "Say whether a rate fits a link, and what each hop delays."),
         "report": ("fwav_hil.cli:report_command", "Score and plot a run folder again."),
         "log": ("fwav_hil.logs.command:log_group", "Read telemetry logs: info, dump, plot, export."),
     }
@@ -108,6 +113,9 @@ plots_option = click.option("--plots/--no-plots", default=True, show_default=Tru
     click.option(
         "--speed", type=click.FloatRange(min=0.001), metavar="X", help="Pace lockstep to X times real time.",
     ),
+    realtime_option,
+    trigger_option,
+    spin_option,
     rate_option,
     duration_option,
     seed_option,
@@ -128,6 +136,9 @@ def run_command(
     law: str | None,
     clock: str,
     speed: float | None,
+    realtime: bool,
+    trigger: str,
+    spin_us: int | None,
     rate: float | None,
     duration: float | None,
     seed: int | None,
@@ -142,6 +153,8 @@ def run_command(
 ) -> None:
     """Fly SCENARIO with the emulator and the controller as two processes that speak MAVLink over a link."""
     chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
+    from bridge.link import refuse_rate_that_cannot_fit
+    from bridge.realtime import check_real_time
     from controller.laws import make_law
     from fwav_hil.compile import compile_kernels
     from fwav_hil.run import RunOptions, check_link, new_folder, run
@@ -150,7 +163,10 @@ def run_command(
     chosen_law = make_law(chosen.law, chosen)
     if chosen_law.needs_velocity:
         raise UsageError(chosen_law.velocity_sentence())
+    check_real_time(clock, realtime=realtime, trigger=trigger)
     check_link(link)
+    if clock == "realtime":
+        refuse_rate_that_cannot_fit(link, chosen.rate_hz)
     if clock != "realtime" and (delay_ns or legs):
         raise UsageError(
             "--delay and --legs are of real time: add --clock realtime (in lockstep the scenario's [delay] is)"
@@ -159,8 +175,9 @@ def run_command(
     folder = new_folder(chosen, out)
     try:
         run_options = RunOptions(
-            clock=clock, link=link, speed=speed, wait_s=wait_s, delay_ns=delay_ns, legs=legs, on_log_error=on_log_error
-        )
+            clock=clock, link=link, speed=speed, wait_s=wait_s, delay_ns=delay_ns, legs=legs, on_log_error=on_log_error,
+            realtime=realtime, trigger=trigger, spin_us=spin_us,
+        )  # fmt: skip
         run(chosen, folder, run_options)
     except FwavHilError:
         # The run's own error is the one to end with, whatever else its folder gives trouble with.

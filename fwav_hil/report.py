@@ -68,9 +68,16 @@ def summarise(folder: Path, *, placement: str = "", budget: dict[str, Any] | Non
         **scores(scenario, truth["t_ns"], truth["q"]),
         "latency_us": emulator.get("latency_us", dict.fromkeys(("p50", "p99", "p999", "max"))),
         "tick_us": emulator.get("tick_us"),
+        "trigger": controller.get("trigger"),
+        "lateness_us": {"emulator": emulator.get("lateness_us"), "controller": controller.get("lateness_us")},
+        "realtime": {"emulator": emulator.get("realtime") or [], "controller": controller.get("realtime") or []},
+        "processor_share": {
+            "emulator": emulator.get("processor_share"),
+            "controller": controller.get("processor_share"),
+        },
         "counters": {
             "missed": ends["controller"].get("missed_samples", 0) + ends["emulator"].get("unanswered", 0),
-            "late": ends["emulator"].get("late", 0) + ends["controller"].get("late_samples", 0),
+            "late": _total(ends, ("late", "late_samples")),
             "dropped": _total(ends, _DROPPED),
             "refused": _total(ends, _REFUSED),
             **ends,

@@ -30,13 +30,16 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     """How the run is made. link: the emulator's URI; the controller gets its counterpart.
 
     show_progress: False where the caller shows its own, and wants no line on the budget. delay_ns, legs: see
-    `EmulatorOptions`.
+    `EmulatorOptions`. realtime, trigger, spin_us: see the commands' options.
     """
 
     clock: str = "lockstep"
     link: str = "udpin://127.0.0.1:14560"
     speed: float | None = None
     wait_s: float = 30.0
+    realtime: bool = False
+    trigger: str = "sample"
+    spin_us: int | None = None
     show_progress: bool = True
     delay_ns: int = 0
     legs: bool = False
@@ -66,7 +69,8 @@ class Placement(msgspec.Struct, frozen=True):
     In lockstep one process waits while the other works. Asleep on a core of its own it costs the wake-up of that core at
     each hand-over; on a shared core it costs a switch of contexts, and cold caches; polling on a core of its own it costs
     neither, only that core. So: two cores and a short spin where there are two, one core where not. In real time each
-    process sleeps, and the scheduler places it.
+    process sleeps, and the scheduler places it; with `--realtime` each has a core of its own, if there are two, and polls
+    the end of a wait only.
     """
 
     text: str
@@ -81,19 +85,29 @@ SPIN_US = "500"
 """How long a lockstep process polls before it sleeps: several ticks' worth; longer waits are stalls."""
 
 
-def choose_placement(clock: str) -> Placement:
+def choose_placement(clock: str, *, realtime: bool = False, spin_us: int | None = None) -> Placement:
     """The placement for a clock mode on this machine."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    if clock == "lockstep" and len(cores) > 1:
-        spin = ("--spin-us", SPIN_US)
+    wanted = () if spin_us is None else ("--spin-us", str(spin_us))
+    if realtime:
+        told = ("--realtime", *wanted)
+        if len(cores) < 2:
+            return Placement("both processes on the one core there is, sleeping while they wait", told, told)
         return Placement(
-            f"a core each (emulator {cores[-1]}, controller {cores[-2]}), polling up to {SPIN_US} us before sleeping",
+            f"a core each (emulator {cores[-1]}, controller {cores[-2]}), polling the end of each wait",
+            ("--core", str(cores[-1]), *told),
+            ("--core", str(cores[-2]), *told),
+        )
+    if clock == "lockstep" and len(cores) > 1:
+        spin = wanted or ("--spin-us", SPIN_US)
+        return Placement(
+            f"a core each (emulator {cores[-1]}, controller {cores[-2]}), polling up to {spin[1]} us before sleeping",
             ("--core", str(cores[-1]), *spin),
             ("--core", str(cores[-2]), *spin),
         )
     if clock == "lockstep" and cores:
-        return Placement("both processes on the one core there is, sleeping while they wait")
-    return Placement("placed by the scheduler, sleeping while they wait")
+        return Placement("both processes on the one core there is, sleeping while they wait", wanted, wanted)
+    return Placement("placed by the scheduler, sleeping while they wait", wanted, wanted)
 
 
 def check_link(uri: str) -> None:
@@ -120,7 +134,7 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
     budget = budget_line(scenario, options.clock)
     if options.show_progress:
         click.echo(f"{'warning: ' if budget.warn else ''}{budget.sentence}", err=True)
-    placement = choose_placement(options.clock)
+    placement = choose_placement(options.clock, realtime=options.realtime, spin_us=options.spin_us)
     common = [
         str(folder / FILES["scenario"]),
         "--clock",
@@ -138,7 +152,9 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
     flight = ["--link", f"{scheme}://{address}", *own, "--on-log-error", options.on_log_error]
     emulator = Child("plant_emulator", [*common, *placement.emulator, *flight])
     # The controller learns its link when the emulator has opened its own: were the port another run's, it must not go there.
-    controller = Child("controller", [*common, *placement.controller, "--link", "-", "--arm"])
+    controller = Child(
+        "controller", [*common, *placement.controller, "--link", "-", "--arm", "--trigger", options.trigger]
+    )
     try:
         _watch(scenario, emulator, controller, stop, Progress(scenario.duration_s) if options.show_progress else None)
     finally:

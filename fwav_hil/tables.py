@@ -33,8 +33,25 @@ def print_summary(summary: dict[str, Any], *, to_stderr: bool = False) -> None:
                 else ""
             )
             console.print(f"{what} {shown}{note}")
+    _print_real_time(console, summary)
     if counters := summary.get("counters"):
         console.print(", ".join(f"{name} {counters[name]}" for name in ("missed", "late", "dropped", "refused")))
+
+
+def _print_real_time(console: Console, summary: dict[str, Any]) -> None:
+    """How late the ticks of a real-time run were, and what the system granted and refused each process."""
+    for end, late in (summary.get("lateness_us") or {}).items():
+        if late and late["p50"] is not None:
+            shown = ", ".join(f"{key} {late[key]:.1f} us" for key in ("p50", "p99", "p999", "max"))
+            console.print(f"{end} wakes late by {shown} (polling the last {late['spin']:.0f} us)")
+    for end, settings in (summary.get("realtime") or {}).items():
+        granted = [setting["name"] for setting in settings if setting["granted"]]
+        if settings:
+            console.print(f"{end} was granted: {', '.join(granted) or 'nothing'}")
+        for setting in settings:
+            if not setting["granted"]:
+                remedy = f"; mend with: {setting['remedy']}" if setting["remedy"] else ""
+                console.print(f"{end} was refused: {setting['name']} ({setting['said']}{remedy})")
 
 
 def _tracking_table(summary: dict[str, Any]) -> Table:

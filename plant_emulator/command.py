@@ -19,10 +19,14 @@ from bridge.command_line import (
     options,
     process_options,
     rate_option,
+    realtime_option,
     scenario_argument,
     seed_option,
+    spin_option,
     wait_option,
 )
+from bridge.link import refuse_rate_that_cannot_fit
+from bridge.realtime import check_real_time, own_core
 from bridge.summary import show_json
 
 EXAMPLE = """
@@ -44,6 +48,8 @@ Example:
         "--speed", type=click.FloatRange(min=0.001), metavar="X",
         help="Pace lockstep to X times real time; without it, as fast as it goes.",
     ),
+    realtime_option,
+    spin_option,
     rate_option,
     duration_option,
     seed_option,
@@ -63,6 +69,8 @@ def emulator(
     link: str,
     clock: str,
     speed: float | None,
+    realtime: bool,
+    spin_us: int | None,
     rate: float | None,
     duration: float | None,
     seed: int | None,
@@ -74,24 +82,20 @@ def emulator(
     json_path: Path | None,
     status: str,
     core: int | None,
-    spin_us: int,
     with_parent: bool,
 ) -> None:
     """Run the plant emulator alone: it waits for a controller, then flies SCENARIO (a file or a name) with it."""
     chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed)
+    check_real_time(clock, realtime=realtime)
+    if clock == "realtime" or speed:
+        refuse_rate_that_cannot_fit(link, chosen.rate_hz * (1.0 if clock == "realtime" else speed or 1.0))
     report, stop = begin_process(status, core, with_parent=with_parent)
     from plant_emulator.process import EmulatorOptions, run_emulator
 
     run_options = EmulatorOptions(
-        link=link,
-        clock=clock,
-        speed=speed,
-        out=out,
-        wait_s=wait_s,
-        spin_s=spin_us * 1e-6,
-        delay_ns=delay_ns,
-        legs=legs,
+        link=link, clock=clock, speed=speed, out=out, wait_s=wait_s, spin_s=None if spin_us is None else spin_us * 1e-6,
+        realtime=realtime, core=own_core(0) if core is None else core, delay_ns=delay_ns, legs=legs,
         on_log_error=on_log_error,
-    )
+    )  # fmt: skip
     summary = run_emulator(chosen, run_options, report, stop)
     show_json(json_path, {"scenario": chosen.name, "rate_hz": chosen.rate_hz, "seed": chosen.seed, **summary})

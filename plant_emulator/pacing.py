@@ -29,6 +29,7 @@ class Pacing(abc.ABC):
     """Carries ticks across the link.
 
     counters        of the pacing, by name
+    keeper          of its schedule, where it has one
     latencies_ns    for each command, wall time from the sending of its sample to the command's arrival
     """
 
@@ -47,6 +48,7 @@ class Pacing(abc.ABC):
         self.clock = clock
         self.stop = stop
         self.period_ns = period_ns
+        self.keeper: RateKeeper | None = None
         self.latencies_ns: list[int] = []
         self.counters: dict[str, int] = {}
         self._owed: list[tuple[int, Sequence[bytes]]] = []
@@ -105,7 +107,7 @@ class Lockstep(Pacing):
     ) -> None:
         super().__init__(emulator, endpoint, log, clock, stop, period_ns)
         self._delay_ns = delay_ns
-        self._keeper = keeper
+        self._keeper = self.keeper = keeper
         self._ahead_until_ns = 0 if keeper else ticks * period_ns
         """Ticks before this time may leave the moment the answer to the one before them is there."""
         self._sent_ns = self._answered_ns = 0
@@ -234,9 +236,11 @@ class RealTime(Pacing):
         clock: Clock,
         stop: StopFlag,
         period_ns: int,
+        *,
+        spin_ns: int = 0,
     ) -> None:
         super().__init__(emulator, endpoint, log, clock, stop, period_ns)
-        self._keeper = RateKeeper(clock, period_ns)
+        self._keeper = self.keeper = RateKeeper(clock, period_ns, spin_ns)
         self._sent: dict[int, int] = {}
         self._newest_ns = -1
         self._begun = False
@@ -268,9 +272,9 @@ class RealTime(Pacing):
             self.legs[0].add(t_ns, self._due_ns, woke_ns, begun_ns)
         if begun_ns >= self.time_sync.next_ns:
             self._say(self.time_sync.question())
-        self._due_ns = deadline_ns = self._keeper.deadline_ns
-        while (remaining_ns := deadline_ns - self.clock.now_ns()) > 0:
-            received = self.endpoint.receive(remaining_ns * 1e-9)
+        self._due_ns = self._keeper.deadline_ns
+        while (wait_s := self._keeper.remaining_s()) is not None:
+            received = self.endpoint.receive(wait_s)
             arrived_ns = self.clock.now_ns()
             for frame in received:
                 since_tick_ns = min(max(0, arrived_ns - begun_ns), self.period_ns)

@@ -8,14 +8,15 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from bridge.clock import Clock, MonotonicClock
+from bridge.clock import Clock, MonotonicClock, processor_time_ns
 from bridge.endpoint import VEHICLE, Endpoint, refuse_other_scenario
 from bridge.faults import DelayedLink
 from bridge.legs import ANSWER_COLUMNS, EMULATOR_FILE, TICK_COLUMNS, LegTable, save_legs
 from bridge.link import Link
 from bridge.memory import memory_pair
 from bridge.process import Report, StopFlag, open_patiently
-from bridge.rate import RateKeeper
+from bridge.rate import RateKeeper, choose_spin_ns
+from bridge.realtime import Settings, has_own_core, maybe_real_time, report_settings
 from bridge.ring_recorder import RingRecorder
 from bridge.sidecar import LinkOfLog
 from bridge.summary import make_folder, percentiles_us, refuse_existing_run, write_json, write_text
@@ -38,8 +39,10 @@ FAREWELLS = 3
 class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     """How the process runs.
 
-    speed: lockstep paced to that multiple of real time (None: as fast as it goes). spin_s: see `Link.spin_s`.
-    delay_ns: real time: what comes is taken so much later. legs: real time: note when each tick and command was where.
+    speed: lockstep paced to that multiple of real time (None: as fast as it goes). delay_ns: real time: what comes is taken
+    so much later. legs: real time: note when each tick and command was where. realtime: ask for what `bridge.realtime`
+    lists, with `core` as the core to have. spin_s: in lockstep see `Link.spin_s` (None: 0); in real time how long to poll
+    before each deadline (None: as measured with `realtime`, else 0).
     on_log_error: what a disk that refuses means for the run: "stop", or "continue" with what can be recorded.
     """
 
@@ -48,10 +51,12 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     speed: float | None = None
     out: Path | None = None
     wait_s: float = 30.0
-    spin_s: float = 0.0
+    spin_s: float | None = None
     delay_ns: int = 0
     legs: bool = False
     on_log_error: str = "stop"
+    realtime: bool = False
+    core: int | None = None
 
 
 def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
@@ -64,7 +69,8 @@ def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, s
         raise UsageError("--legs needs a folder for the time stamps: add --out DIR")
     warm_up(scenario)
     with open_patiently(options.link, options.wait_s, stop) as link:
-        link.spin_s = options.spin_s
+        if options.clock == "lockstep":
+            link.spin_s = options.spin_s or 0.0
         if options.legs or options.delay_ns:
             link.stamp_receives()  # a delay counts from the arrival, not from when we got round to it
         delayed = DelayedLink(link, options.delay_ns, MonotonicClock()) if options.delay_ns else link
@@ -84,13 +90,15 @@ def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report
             log, truth = _open_files(scenario, link, options, options.out, report)
         endpoint = Endpoint(link, VEHICLE[0], scenario.wire.emulator_component)
         emulator = Emulator(scenario, endpoint, truth)
-        pacing = _pacing(scenario, options, emulator, endpoint, log, MonotonicClock(), stop)
-        report({"event": "waiting", "link": link.uri})
-        meet_controller(scenario, options.wait_s, endpoint, stop)
-        report({"event": "started", "peer": link.peer})
-        if options.legs and isinstance(pacing, RealTime):
-            pacing.legs = LegTable(TICK_COLUMNS), LegTable(ANSWER_COLUMNS)
-        return _run_ticks(scenario, emulator, pacing, options.out, report)
+        with maybe_real_time(options.core, wanted=options.realtime) as settings:
+            report_settings(report, settings)
+            pacing = _pacing(scenario, options, emulator, endpoint, log, MonotonicClock(), stop, settings)
+            report({"event": "waiting", "link": link.uri})
+            meet_controller(scenario, options.wait_s, endpoint, stop)
+            report({"event": "started", "peer": link.peer})
+            if options.legs and isinstance(pacing, RealTime):
+                pacing.legs = LegTable(TICK_COLUMNS), LegTable(ANSWER_COLUMNS)
+            return _run_ticks(scenario, emulator, pacing, options.out, report, settings)
     finally:
         _close_files(log, truth)
 
@@ -153,9 +161,11 @@ def _pacing(
     log: TlogWriter | None,
     clock: Clock,
     stop: StopFlag,
+    settings: Settings,
 ) -> Pacing:
     if options.clock == "realtime":
-        return RealTime(emulator, endpoint, log, clock, stop, scenario.period_ns)
+        spin_ns = choose_spin_ns(clock, scenario.period_ns, options.spin_s, measure=has_own_core(settings))
+        return RealTime(emulator, endpoint, log, clock, stop, scenario.period_ns, spin_ns=spin_ns)
     keeper = RateKeeper(clock, round(scenario.period_ns / options.speed)) if options.speed else None
     return Lockstep(
         emulator, endpoint, log, clock, stop, scenario.period_ns,
@@ -206,10 +216,10 @@ def meet_controller(scenario: Scenario, wait_s: float, endpoint: Endpoint, stop:
 
 
 def _run_ticks(
-    scenario: Scenario, emulator: Emulator, pacing: Pacing, out: Path | None, report: Report
+    scenario: Scenario, emulator: Emulator, pacing: Pacing, out: Path | None, report: Report, settings: Settings
 ) -> dict[str, Any]:
     period_ns, clock = scenario.period_ns, pacing.clock
-    begun_ns = clock.now_ns()
+    begun_ns, processor_ns = clock.now_ns(), processor_time_ns()
     next_progress_ns = last_ns = begun_ns
     ticks_ns: list[int] = []
     done = 0
@@ -230,6 +240,7 @@ def _run_ticks(
     except FwavHilError as stopped:
         error = stopped
     wall_ns = clock.now_ns() - begun_ns
+    processor_ns = processor_time_ns() - processor_ns
     _say_farewell(emulator, pacing, done * period_ns)
     counters = {**emulator.all_counters(), **pacing.counters}
     summary = {
@@ -238,6 +249,9 @@ def _run_ticks(
         "wall_s": wall_ns / NANOSECONDS,
         "latency_us": percentiles_us(pacing.latencies_ns),
         "tick_us": percentiles_us(ticks_ns),
+        "lateness_us": pacing.keeper.summary() if pacing.keeper else None,
+        "realtime": settings,
+        "processor_share": processor_ns / max(1, wall_ns),
         "counters": counters,
         "error": str(error) if error else None,
     }

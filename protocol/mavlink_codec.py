@@ -26,9 +26,10 @@ SIGNATURE_SIZE = 13
 SIGNED = 0x01
 LONGEST_FRAME = HEADER_V2 + 255 + CRC_SIZE + SIGNATURE_SIZE
 HALF_SEQUENCE = 128
+_SHORTEST_FRAME = HEADER_V2 + 1 + CRC_SIZE
 
 _crc = fastcrc.crc16.mcrf4xx
-_HEADER = struct.Struct("<BBBBBBBHB")  # the id is 24 bits: 16 and 8
+_unpack_header = struct.Struct("<xBBxBBBHB").unpack_from  # without magic and compat; the id is 24 bits: 16 and 8
 _MAGIC = bytes([MAGIC_V2])
 
 
@@ -66,12 +67,15 @@ class Layout:
         self.id_bytes: bytes = self.message_id.to_bytes(3, "little")
         self.crc_seed = bytes([message.crc_extra])
         self.pack: Callable[..., bytes] = self.structure.pack
+        self._unpack: Callable[[bytes], tuple[Any, ...]] = self.structure.unpack
         self.dtype = np.dtype([_column(field, kinds[field], length)
                                for field, length in zip(self.fields, message.array_lengths, strict=True)])  # fmt: skip
 
     def unpack(self, payload: bytes) -> tuple[Any, ...]:
         """Values in wire order; a payload shorter than the message had its trailing zeros cut off."""
-        return self.structure.unpack(payload.ljust(self.size, b"\0")[: self.size])
+        if len(payload) != self.size:
+            payload = payload.ljust(self.size, b"\0")[: self.size]
+        return self._unpack(payload)
 
     def pack_fields(self, **values: Any) -> bytes:
         """Payload from values by field name; a field left out is zero. Raises KeyError for a name the message lacks."""
@@ -122,6 +126,9 @@ class Frame(NamedTuple):
     component: int
     payload: bytes
     raw: bytes
+
+
+_new_frame: Callable[[type[Frame], tuple[Any, ...]], Frame] = tuple.__new__  # what Frame(...) does, in half the time
 
 
 class FrameWriter:
@@ -193,8 +200,13 @@ class FrameReader:
         if self._rest:
             data = self._rest + data
             self._rest = b""
-        frames: list[Frame] = []
         at, end = 0, len(data)
+        if end >= _SHORTEST_FRAME and data[0] == MAGIC_V2 and data[1] == end - HEADER_V2 - CRC_SIZE and not data[2]:
+            frame = self._check(data, 0, end)  # the plain case: just one frame, unsigned
+            if frame is not None:
+                return [frame]
+            at = 1
+        frames: list[Frame] = []
         while at < end:
             if data[at] != MAGIC_V2:
                 if self._keep_mavlink1 and data[at] == MAGIC_V1:
@@ -232,8 +244,9 @@ class FrameReader:
 
     def _check(self, data: bytes, at: int, size: int) -> Frame | None:
         """The frame of that size at `at`, or None (counted) where it is none."""
-        _, length, flags, _, sequence, system, component, low, high = _HEADER.unpack_from(data, at)
-        number = low | high << 16
+        length, flags, sequence, system, component, number, high = _unpack_header(data, at)
+        if high:
+            number |= high << 16
         message = self._layouts.get(number)
         stop = at + HEADER_V2 + length
         if message is None:
@@ -249,8 +262,13 @@ class FrameReader:
             self.counters["unknown_flags"] += 1
             return None
         if self._follow_sequence:
-            self._follow(system, component, sequence)
-        return Frame(number, sequence, system, component, data[at + HEADER_V2 : stop], data[at : at + size])
+            key = (system, component)
+            if self._next.get(key) == sequence:  # in line, as nearly always
+                self._next[key] = (sequence + 1) & 0xFF
+            else:
+                self._follow(key, sequence)
+        raw = data if size == len(data) else data[at : at + size]
+        return _new_frame(Frame, (number, sequence, system, component, data[at + HEADER_V2 : stop], raw))
 
     def expected(self, sender: tuple[int, int]) -> int:
         """The number of the next frame of a (system, component); -1 where it is not followed, or a frame is half read."""
@@ -260,8 +278,7 @@ class FrameReader:
         """Have `number` expected next of a sender whose frames were read elsewhere."""
         self._next[sender] = number & 0xFF
 
-    def _follow(self, system: int, component: int, sequence: int) -> None:
-        key = (system, component)
+    def _follow(self, key: tuple[int, int], sequence: int) -> None:
         ahead = (sequence - self._next.get(key, sequence)) & 0xFF
         if ahead < HALF_SEQUENCE:
             self.counters["sequence_gaps"] += ahead

@@ -23,12 +23,13 @@ class End(enum.Enum):
 
 
 class Stream(NamedTuple):
-    """One row: a MAVLink message, its sender, its rate and its rule."""
+    """One row: a MAVLink message, its sender, its rate and its rule; each_tick: one of it for every tick."""
 
     message: str
     sender: End
     rate_hz: float | None
     rule: str
+    each_tick: bool = False
 
 
 STREAMS = (
@@ -36,10 +37,14 @@ STREAMS = (
     Stream(
         "AUTOPILOT_VERSION", End.BOTH, None, "at the start: 8 bytes of the scenario's digest; a mismatch is refused"
     ),
-    Stream("ATT_POS_MOCAP", End.EMULATOR, None, "every tick, before it: position and attitude, all that a law reads"),
-    Stream("HIL_SENSOR", End.EMULATOR, None, "the tick: simulation time, and an IMU for real autopilots"),
+    Stream(
+        "ATT_POS_MOCAP", End.EMULATOR, None, "every tick, before it: position and attitude, all that a law reads", True
+    ),
+    Stream("HIL_SENSOR", End.EMULATOR, None, "the tick: simulation time, and an IMU for real autopilots", True),
     Stream("HIL_GPS", End.EMULATOR, 10.0, "for real autopilots"),
-    Stream("HIL_ACTUATOR_CONTROLS", End.CONTROLLER, None, "one for each tick; time_usec echoes the sample it answers"),
+    Stream(
+        "HIL_ACTUATOR_CONTROLS", End.CONTROLLER, None, "one for each tick; time_usec echoes the sample it answers", True
+    ),
     Stream("POSITION_TARGET_LOCAL_NED", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
     Stream("ATTITUDE_TARGET", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
     Stream(

@@ -143,9 +143,9 @@ class TestOptions:
 
         assert run_command(command, "prog", ["--help"]) == 0
         shown = capsys.readouterr().out
-        assert not [name for name in ("--status", "--core", "--spin-us", "--with-parent") if name in shown]
+        assert not [name for name in ("--status", "--core", "--with-parent") if name in shown]
         assert run_command(command, "prog", ["--status", "jsonl", "--core", "1", "--with-parent"]) == 0
-        assert json.loads(capsys.readouterr().out) == {"status": "jsonl", "core": 1, "spin_us": 0, "with_parent": True}
+        assert json.loads(capsys.readouterr().out) == {"status": "jsonl", "core": 1, "with_parent": True}
 
 
 class TestChosenScenario:

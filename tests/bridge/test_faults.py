@@ -98,7 +98,7 @@ def test_each_comes_later_by_the_delay_and_in_its_order(gaps_ns: list[int], dela
         t_ns += gap_ns
         arrivals.append((t_ns, bytes([number])))
     delayed = DelayedLink(Arrivals(clock, arrivals, stamped=True), delay_ns, clock)
-    came = []
+    came: list[bytes] = []
     while len(came) < len(arrivals):
         begun_ns = clock.now_ns()
         data = delayed.recv(timeout_s)

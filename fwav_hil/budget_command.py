@@ -1,0 +1,86 @@
+"""`fwav-hil budget`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from bridge.command_line import chosen_scenario, json_option, options, rate_option, scenario_argument
+from bridge.summary import is_stdout, show_json
+from protocol.errors import UsageError
+
+if TYPE_CHECKING:
+    from bridge.budget import Budget
+
+
+@click.command("budget", epilog="\b\nExample:\n  fwav-hil budget --link serial:///dev/ttyUSB0:921600 --rate 500")
+@options(
+    scenario_argument,
+    click.option(
+        "--link", required=True, metavar="URI", help="The link, at either end: serial://, udpin://, tcpout:// ..."
+    ),
+    rate_option,
+    json_option,
+)  # fmt: skip
+def budget(scenario: str, link: str, rate: float | None, json_path: Path | None) -> None:
+    """Say whether SCENARIO's messages fit a link at a rate, and what each hop of the loop adds to the delay.
+
+    Nothing is opened. `emulator` and `controller` ask the same before they keep wall time on a serial line.
+
+    \b
+    Exit code: 0 where the rate fits, else 2.
+    """
+    chosen = chosen_scenario(scenario, rate_hz=rate)
+    from bridge.budget import link_budget
+
+    found = link_budget(link, chosen.rate_hz)
+    planned_s = chosen.delay_ns * 1e-9
+    _print(found, planned_s, to_stderr=is_stdout(json_path))
+    show_json(json_path, {"budget": found, "scenario": chosen.name, "scenario_delay_s": planned_s})
+    if not found.fits:
+        raise UsageError(found.sentence)
+    click.echo(found.sentence, err=is_stdout(json_path))
+
+
+def _print(found: Budget, planned_s: float, *, to_stderr: bool) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr)
+    table = Table("message", title=f"{found.link} at {found.rate_hz:g} Hz", title_justify="left")
+    for column in ("bytes", "rate", "bytes/s", "share"):
+        table.add_column(column, justify="right")
+    for way in found.ways:
+        capacity = way.capacity_bytes_per_s
+        table.add_row(f"[bold]{way.name}[/bold]")
+        for row in way.messages:
+            size, often = str(row.frame_bytes), f"{row.rate_hz:g} Hz"
+            table.add_row(
+                f"  {row.message}", size, often, f"{row.bytes_per_s:.0f}", _percent(row.bytes_per_s / capacity)
+            )
+        if way.overhead_bytes_per_s:
+            overhead = way.overhead_bytes_per_s
+            table.add_row("  headers of datagrams", "", "", f"{overhead:.0f}", _percent(overhead / capacity))
+        table.add_row(f"  together, of {capacity:.0f}", "", "", f"{way.bytes_per_s:.0f}", _percent(way.share))
+    console.print(table)
+    table = Table("hop", title="From a sample to its command", title_justify="left")
+    table.add_column("delay", justify="right")
+    table.add_column("")
+    for hop in found.hops:
+        table.add_row(hop.name, f"{1e3 * hop.delay_s:.3f} ms", hop.note)
+    table.add_row("together", f"{1e3 * found.delay_s:.3f} ms", f"{found.delay_periods:.2f} periods")
+    console.print(table)
+    console.print(
+        "The two processes' own time comes on top (`fwav-hil latency` measures it), and the plant holds each command for a "
+        f"period. In lockstep and `simulate` the scenario's own delay stands in for all this: {1e3 * planned_s:g} ms."
+    )
+    if found.delay_periods > 1:
+        console.print(
+            "A command comes after the next tick has left: it answers an older sample, and ticks count as unanswered."
+        )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
