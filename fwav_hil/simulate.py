@@ -24,6 +24,7 @@ from plant_emulator.integrate import (
 from plant_emulator.safety import clamp
 from plant_emulator.sensors import PositionSensor, add_noise
 from protocol.compiled import Packed, compiled
+from protocol.errors import UsageError
 from protocol.mavlink_map import pose_from_wire, pose_to_wire
 from protocol.messages import FloatArray
 from protocol.scenario import Scenario
@@ -95,8 +96,13 @@ def simulate(
 ) -> Simulation:
     """Run a scenario; `law` replaces the scenario's own. A divergence ends the run early and is named in the result.
 
-    delays_ns (ticks,): the delay of each tick's command in place of the scenario's; one below 0 never acts.
+    delays_ns (ticks,): the delay of each tick's command in place of the scenario's; one below 0 never acts. Raises UsageError
+    where their number is another.
     """
+    if delays_ns is None:
+        delays_ns = np.full(scenario.ticks, scenario.delay_ns)
+    if delays_ns.shape != (scenario.ticks,):
+        raise UsageError(f"delays of shape {delays_ns.shape} for {scenario.ticks} ticks: give one for each tick")
     law = law or make_law(scenario.law, scenario)
     plant = Plant(scenario)
     state = law.start()
@@ -107,7 +113,7 @@ def simulate(
         state.packed,
         plant.state.packed,
         plant.parameters,
-        np.full(scenario.ticks, scenario.delay_ns, dtype=np.int64) if delays_ns is None else delays_ns,
+        np.ascontiguousarray(delays_ns, dtype=np.int64),
         normal,
         scenario.noise.position,
         scenario.noise.attitude,

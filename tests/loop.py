@@ -41,12 +41,13 @@ def fly_both(
     controller_scenario: Scenario | None = None,
     clock: str = "lockstep",
     arm: bool = True,
+    legs: bool = False,
     wait_s: float = 20.0,
 ) -> Ends:
     """Run both ends to their end."""
     theirs = controller_scenario or scenario
-    emulator = EmulatorOptions(link="-", clock=clock, out=out, wait_s=wait_s)
-    service_options = ControllerOptions(link="-", clock=clock, out=out, wait_s=wait_s, arm=arm)
+    emulator = EmulatorOptions(link="-", clock=clock, out=out, wait_s=wait_s, legs=legs)
+    service_options = ControllerOptions(link="-", clock=clock, out=out, wait_s=wait_s, arm=arm, legs=legs)
     law = make_law(theirs.law, theirs)
     plant_emulator.process.warm_up(scenario)
     controller_process.warm_up(law)

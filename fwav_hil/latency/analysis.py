@@ -33,12 +33,14 @@ class Legs(NamedTuple):
     durations_ns   leg -> (n,) ns; a leg that is not known for a sample is -1 there
     delay_ns (n,)  from the sample to the action of its command, in simulation time
     clock          TIMESYNC's estimate of the controller's clock less the emulator's, None where nobody answered
+    negative       durations that came out negative and count as 0: so much for the clocks
     """
 
     t_ns: Rows
     durations_ns: dict[str, Rows]
     delay_ns: Rows
     clock: Estimate | None
+    negative: int
 
     def known(self, leg: str) -> Rows:
         """The durations of a leg, those that are known."""
@@ -46,36 +48,53 @@ class Legs(NamedTuple):
         return values[values >= 0]
 
 
-def join_legs(folder: Path, controller_folder: Path | None = None, *, offset_ns: int = 0) -> Legs:
-    """The legs of a run; offset_ns: the controller's clock less the emulator's, 0 on one machine. Raises RunFolderError."""
-    emulator, clock = load_legs(folder / EMULATOR_FILE)
-    controller, _ = load_legs((controller_folder or folder) / CONTROLLER_FILE)
-    return legs_of(emulator["ticks"], emulator["answers"], controller["samples"], clock, offset_ns=offset_ns)
+def join_legs(folder: Path, controller_folder: Path | None = None) -> Legs:
+    """The legs of a run: on one machine with one clock, with a controller_folder with two, related by TIMESYNC.
+
+    Raises RunFolderError.
+    """
+    (ticks, answers), clock = load_legs(folder / EMULATOR_FILE, "ticks", "answers")
+    (samples,), _ = load_legs((controller_folder or folder) / CONTROLLER_FILE, "samples")
+    offset_ns = 0 if controller_folder is None else clock.offset_ns if clock else None
+    return legs_of(ticks, answers, samples, clock, offset_ns=offset_ns)
 
 
-def legs_of(ticks: Rows, answers: Rows, samples: Rows, clock: Estimate | None, *, offset_ns: int = 0) -> Legs:
-    """The legs of rows as `bridge.legs` describes them; samples whose command was never applied are left out."""
+def legs_of(ticks: Rows, answers: Rows, samples: Rows, clock: Estimate | None, *, offset_ns: int | None = 0) -> Legs:
+    """The legs of rows as `bridge.legs` describes them; samples whose command was never applied are left out.
+
+    offset_ns: the controller's clock less the emulator's, 0 on one machine; None where nobody knows, and with it no leg from
+    one end to the other.
+    """
     t_ns = np.intersect1d(np.intersect1d(ticks[:, 0], answers[:, 0]), samples[:, 0])
     tick = _columns(ticks, t_ns, TICK_COLUMNS)
     answer = _columns(answers, t_ns, ANSWER_COLUMNS)
     sample = _columns(samples, t_ns, SAMPLE_COLUMNS)
-    sample = {name: np.where(stamps > 0, stamps - offset_ns, 0) for name, stamps in sample.items()}
+    sent, back = tick["sent_ns"], answer["kernel_ns"]
+    if offset_ns is None:
+        sent, back = np.zeros_like(sent), np.zeros_like(back)
     route = (
         ("wake", tick["due_ns"], tick["woke_ns"]),
         ("sense", tick["woke_ns"], tick["sent_ns"]),
-        ("to_kernel", tick["sent_ns"], sample["kernel_ns"]),
+        ("to_kernel", sent, _shifted(sample["kernel_ns"], offset_ns)),
         ("to_controller", sample["kernel_ns"], sample["woke_ns"]),
         ("compute", sample["woke_ns"], sample["computed_ns"]),
         ("hand_over", sample["computed_ns"], sample["sent_ns"]),
-        ("back_to_kernel", sample["sent_ns"], answer["kernel_ns"]),
+        ("back_to_kernel", _shifted(sample["sent_ns"], offset_ns), back),
         ("to_emulator", answer["kernel_ns"], answer["woke_ns"]),
         ("apply", answer["woke_ns"], answer["applied_ns"]),
         ("age", tick["sent_ns"], answer["applied_ns"]),
     )
-    durations = {
-        name: np.where((begun > 0) & (ended > 0), np.maximum(0, ended - begun), -1) for name, begun, ended in route
-    }
-    return Legs(t_ns, durations, answer["acts_ns"] - t_ns, clock)
+    durations, negative = {}, 0
+    for name, begun, ended in route:
+        known = (begun != 0) & (ended != 0)
+        negative += int((known & (ended < begun)).sum())
+        durations[name] = np.where(known, np.maximum(0, ended - begun), -1)
+    return Legs(t_ns, durations, answer["acts_ns"] - t_ns, clock, negative)
+
+
+def _shifted(stamps_ns: Rows, offset_ns: int | None) -> Rows:
+    """Stamps of the controller on the emulator's clock; those that are not known stay 0."""
+    return np.where(stamps_ns != 0, stamps_ns - (offset_ns or 0), 0)
 
 
 def _columns(rows: Rows, t_ns: Rows, names: tuple[str, ...]) -> dict[str, npt.NDArray[np.int64]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,7 @@ from bridge.command_line import (
     wait_option,
 )
 from bridge.summary import is_stdout, read_json, show_json, write_json
+from protocol.errors import FwavHilError, Interrupted, PeerMissingError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 FREE_PORT = "udpin://127.0.0.1:0"
+_ASKED_RATE_HZ, _ASKED_S = 50.0, 10.0
+_MOST_HZ, _MOST_QUESTIONS = 10_000.0, 10_000_000.0
 EXAMPLE = """
 \b
 Example:
@@ -61,15 +65,14 @@ Example:
     ),
     wait_option, json_option,
 )  # fmt: skip
+@click.pass_context
 def latency(
-    scenario: str, law: str | None, rate: float | None, duration: float | None, seed: int | None, link: str,
-    delay_ns: int, against: bool, folder: Path | None, controller_folder: Path | None, out: Path | None, wait_s: float,
-    json_path: Path | None,
+    context: click.Context, scenario: str, law: str | None, rate: float | None, duration: float | None, seed: int | None,
+    link: str, delay_ns: int, against: bool, folder: Path | None, controller_folder: Path | None, out: Path | None,
+    wait_s: float, json_path: Path | None,
 ) -> None:  # fmt: skip
     """Measure where the time goes between a sample and its command, in the real-time closed loop or on a real link."""
     from rich.console import Console
-
-    from protocol.errors import UsageError
 
     to_stderr = is_stdout(json_path)
     terminal = (sys.stderr if to_stderr else sys.stdout).isatty()
@@ -77,40 +80,75 @@ def latency(
     if controller_folder and not folder:
         raise UsageError("--controller-from says where the other half of --from DIR is: give both")
     if folder:
-        _report(folder, controller_folder, {}, console, json_path)
+        _refuse_others(context, "with --from nothing is flown", ("folder", "controller_folder", "json_path"))
+        _report(folder, controller_folder, None, console, json_path)
         return
     if link.partition("://")[0] not in ("udpin", "tcpin"):
-        _ask(link, rate or 50.0, duration or 10.0, wait_s, console, json_path)
+        _refuse_others(
+            context,
+            f"whoever is at {link} is asked by TIMESYNC alone",
+            ("link", "rate", "duration", "wait_s", "json_path"),
+        )
+        rate_hz, seconds = _ASKED_RATE_HZ if rate is None else rate, _ASKED_S if duration is None else duration
+        _ask(link, rate_hz, seconds, wait_s, console, json_path)
         return
     chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
     from bridge.process import StopFlag
+    from controller.laws import make_law
     from fwav_hil.compile import compile_kernels
-    from fwav_hil.latency.study import beside, closed_loop
-    from fwav_hil.run import new_folder
+    from fwav_hil.latency.study import LONGEST_PROBING_S, beside, closed_loop
+    from fwav_hil.run import check_link, new_folder
 
+    chosen_law = make_law(chosen.law, chosen)
+    if chosen_law.needs_velocity:
+        raise UsageError(chosen_law.velocity_sentence())
+    check_link(link)
     compile_kernels(chosen)
     folder = new_folder(chosen, out)
-    closed_loop(chosen, folder, link=link, delay_ns=delay_ns, wait_s=wait_s)
+    try:
+        closed_loop(chosen, folder, link=link, delay_ns=delay_ns, wait_s=wait_s)
+    except FwavHilError:
+        # The run's own error is the one to end with; what there is of it is reported all the same.
+        with contextlib.suppress(FwavHilError):
+            _report(folder, None, {}, console, json_path)
+        raise
     stop = StopFlag()
     stop.install()
-    with _bar() as told:
-        found = beside(chosen.rate_hz, stop, told, against=against)
+    try:
+        with _Bar() as told:
+            found = beside(chosen.rate_hz, min(LONGEST_PROBING_S, chosen.duration_s), stop, told, against=against)
+    except Interrupted:
+        raise Interrupted(
+            f"interrupted after the run, which is in {folder}: `fwav-hil latency --from {folder}` reports it"
+        ) from None
     _report(folder, None, found, console, json_path)
 
 
+def _refuse_others(context: click.Context, why: str, known: tuple[str, ...]) -> None:
+    """Raise UsageError where an argument was given that would do nothing."""
+    for parameter in context.command.params:
+        given = context.get_parameter_source(parameter.name or "") is not click.core.ParameterSource.DEFAULT
+        if given and parameter.name not in known:
+            name = parameter.opts[0] if parameter.opts[0].startswith("-") else parameter.opts[0].upper()
+            raise UsageError(f"{why}, so {name} would do nothing: leave it out")
+
+
 def _report(
-    folder: Path, controller_folder: Path | None, found: dict[str, Any], console: Console, json_path: Path | None
+    folder: Path, controller_folder: Path | None, found: dict[str, Any] | None, console: Console, json_path: Path | None
 ) -> None:
-    """Write and show what the time stamps in a run folder say, beside what else was found."""
-    from fwav_hil.latency.analysis import LEGS
+    """Write and show what the time stamps in a run folder say, beside what else was found (None: when it was flown)."""
+    from fwav_hil.latency.analysis import LEGS, join_legs
     from fwav_hil.latency.figures import draw
-    from fwav_hil.latency.study import report_of, write_files
+    from fwav_hil.latency.study import report_of, summary_of, write_files
     from fwav_hil.latency.tables import print_report
     from fwav_hil.report import FILES
     from protocol.scenario import load_scenario
 
+    legs = join_legs(folder, controller_folder)
     scenario = load_scenario(folder / FILES["scenario"])
-    report, legs = report_of(scenario, read_json(folder / FILES["summary"]), folder, controller_folder)
+    report = report_of(scenario, summary_of(folder, controller_folder), legs, two_clocks=controller_folder is not None)
+    if found is None:
+        found = read_json(folder / "latency.json").get("beside", {})
     durations = {name: legs.known(name) for name in LEGS}
     files = write_files(folder, durations)
     known = legs.durations_ns["age"] >= 0
@@ -125,17 +163,22 @@ def _report(
 
 
 def _ask(uri: str, rate_hz: float, seconds: float, wait_s: float, console: Console, json_path: Path | None) -> None:
-    """Probe whoever is at the link by TIMESYNC."""
+    """Probe whoever is at the link by TIMESYNC. Raises UsageError, what the link raises, PeerMissingError, Interrupted."""
     from bridge.process import StopFlag, open_patiently
     from fwav_hil.latency.histogram import percentiles
     from fwav_hil.latency.peers import probe_time_sync
     from fwav_hil.latency.tables import print_probes
-    from protocol.errors import PeerMissingError
 
+    count = rate_hz * seconds
+    if not (0.0 < rate_hz <= _MOST_HZ and 1.0 <= count <= _MOST_QUESTIONS):
+        raise UsageError(
+            f"{rate_hz:g} questions a second for {seconds:g} s cannot be asked: --rate is up to {_MOST_HZ:g}, and --rate times "
+            f"--duration from 1 to {_MOST_QUESTIONS:g}"
+        )
+    count = round(count)
     stop = StopFlag()
     stop.install()
-    count = max(1, round(rate_hz * seconds))
-    with open_patiently(uri, wait_s, stop) as link, _bar() as told:
+    with open_patiently(uri, wait_s, stop) as link, _Bar() as told:
         link.stamp_receives()
         result, clock = probe_time_sync(
             link, stop, rate_hz=rate_hz, count=count, told=lambda sent: told("asking", sent / count)
@@ -153,6 +196,7 @@ def _ask(uri: str, rate_hz: float, seconds: float, wait_s: float, console: Conso
         "lost": result.lost,
         "duplicate": result.duplicates,
         "out_of_order": result.out_of_order,
+        "unknown": result.unknown,
         "clock_offset_us": clock.offset_ns / 1e3,
         "clock_offset_bound_us": clock.error_ns / 1e3,
     }
@@ -160,7 +204,7 @@ def _ask(uri: str, rate_hz: float, seconds: float, wait_s: float, console: Conso
     show_json(json_path, shown)
 
 
-class _bar:
+class _Bar:
     """A progress bar on a terminal; gives a function of what is done and which share of it."""
 
     def __enter__(self) -> Callable[[str, float], None]:

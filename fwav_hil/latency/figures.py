@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from protocol.errors import RunFolderError
 
 COLOURS = ("#0b61a4", "#c2410c", "#3f7d20", "#7a4fa3", "#7a7a7a", "#b8860b")
+STYLES = ("-", "--", ":")
 _TICKS = (0.0, 0.5, 0.9, 0.99, 0.999, 0.9999)
 
 
@@ -27,19 +28,21 @@ def draw(
     FigureCanvasAgg(figure)
     figure.suptitle(title)
     left, right = figure.subplots(1, 2)
-    for (name, values), colour in zip(curves.items(), COLOURS * 3, strict=False):
+    for number, (name, values) in enumerate(curves.items()):
         ordered = np.sort(values) / 1e3
         if not len(ordered):
             continue
         share = (np.arange(len(ordered)) + 0.5) / len(ordered)
-        left.plot(1.0 / (1.0 - share), ordered, color=colour, linewidth=1.3, label=name)
+        style = {"color": COLOURS[number % len(COLOURS)], "linestyle": STYLES[number // len(COLOURS) % len(STYLES)]}
+        left.plot(1.0 / (1.0 - share), ordered, linewidth=1.3, label=name, **style)
     left.set_xscale("log")
     left.set_yscale("log")
     left.set_xticks([1.0 / (1.0 - share) for share in _TICKS], [f"{100 * share:g} %" for share in _TICKS])
     left.minorticks_off()
     left.set_xlabel("percentile")
     left.set_ylabel("us")
-    left.legend(loc="upper left", fontsize=8)
+    if left.lines:
+        left.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8)
     t, name, values = series
     right.plot(t, values / 1e3, ".", color=COLOURS[0], markersize=2)
     right.set_xlabel("time (s)")

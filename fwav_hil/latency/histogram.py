@@ -31,8 +31,11 @@ def percentiles(durations_ns: npt.NDArray[np.int64]) -> dict[str, float | int | 
     if not len(durations_ns):
         return {"count": 0, **dict.fromkeys((*PERCENTILES, "max"))}
     histogram = histogram_of(durations_ns)
-    shown = {name: histogram.get_value_at_percentile(share) / 1e3 for name, share in PERCENTILES.items()}
-    return {"count": len(durations_ns), **shown, "max": float(durations_ns.max()) / 1e3}
+    most_us = float(durations_ns.max()) / 1e3
+    shown = {  # a histogram gives the upper end of a bin, which may lie above the largest value
+        name: min(most_us, histogram.get_value_at_percentile(share) / 1e3) for name, share in PERCENTILES.items()
+    }
+    return {"count": len(durations_ns), **shown, "max": most_us}
 
 
 def write_hgrm(path: Path, durations_ns: npt.NDArray[np.int64]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -26,6 +27,8 @@ from protocol.tick_frames import TickWriter
 
 GROUND_STATION = (255, 190)
 EMULATOR = (1, 191)
+_HISTOGRAM_US = 100_000
+_LOOK_S = 0.1
 Told = Callable[[int], None]
 
 
@@ -36,7 +39,7 @@ def probe_time_sync(
     clock = MonotonicClock()
     endpoint = Endpoint(link, *GROUND_STATION)
     numbers: dict[int, int] = {}
-    best: list[tuple[int, int]] = []
+    best: dict[int, tuple[int, int]] = {}
     others = TimeSync(endpoint, clock)
 
     def question(number: int) -> bytes:
@@ -48,17 +51,18 @@ def probe_time_sync(
         arrived_ns = link.received_ns or clock.now_ns()
         found = []
         for frame in endpoint.reader.read(data):
-            if frame.message_id != mavlink_map.TIMESYNC.message_id:
-                continue
+            if frame.message_id != mavlink_map.TIMESYNC.message_id or (frame.system, frame.component) == GROUND_STATION:
+                continue  # a line that gives back what is sent knows no time
             answer_ns, asked_ns = mavlink_map.decode_timesync(frame.payload)
             if answer_ns == 0:  # the other end asks too
                 reply = others.take(frame, arrived_ns)
                 if reply:
                     link.send(reply)
                 continue
-            found.append(numbers.get(asked_ns, -1))
-            if asked_ns in numbers:
-                best.append((arrived_ns - asked_ns, answer_ns - (asked_ns + arrived_ns) // 2))
+            number = numbers.get(asked_ns, -1)
+            found.append(number)
+            if number >= 0 and arrived_ns >= asked_ns:
+                best.setdefault(number, (arrived_ns - asked_ns, answer_ns - (asked_ns + arrived_ns) // 2))
         return found
 
     result = probe(
@@ -73,7 +77,7 @@ def probe_time_sync(
     )
     if not best:
         return result, None
-    round_trip_ns, offset_ns = min(best)
+    round_trip_ns, offset_ns = min(best.values())
     return result, Estimate(offset_ns, round_trip_ns, len(best))
 
 
@@ -135,8 +139,13 @@ def _probe_port(
 
 @contextmanager
 def _child(module: str, *arguments: str) -> Iterator[str]:
-    """A module of ours as a process; gives the first line it writes, and ends it."""
-    process = subprocess.Popen([sys.executable, "-m", module, *arguments], stdout=subprocess.PIPE, text=True)
+    """A module of ours as a process; gives the first line it writes, and ends it.
+
+    It has a session of its own: a Ctrl-C is for us alone, and we end it.
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-m", module, *arguments], stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
     try:
         line = process.stdout.readline().strip() if process.stdout else ""
         if not line:
@@ -147,23 +156,54 @@ def _child(module: str, *arguments: str) -> Iterator[str]:
         process.communicate()
 
 
-def cyclictest(rate_hz: float, seconds: float) -> npt.NDArray[np.int64] | None:
+def cyclictest(stop: StopFlag, *, rate_hz: float, seconds: float, told: Told) -> npt.NDArray[np.int64] | None:
     """Wake-up lateness of cyclictest (Debian rt-tests), ns, whole microseconds; None where it is not installed or refuses.
 
-    It runs at the period of rate_hz, without asking for a priority of its own: as an ordinary process, like ours.
+    It runs at the period of rate_hz, without asking for a priority or for quick idle states: as an ordinary process, like
+    ours. `told` hears the loops that should be done by now. Raises Interrupted.
     """
     program = shutil.which("cyclictest") or ("/usr/sbin/cyclictest" if Path("/usr/sbin/cyclictest").exists() else None)
     if program is None:
         return None
     period_us, loops = round(1e6 / rate_hz), round(rate_hz * seconds)
-    command = [program, "-q", "--policy=other", "-t1", f"-i{period_us}", f"-l{loops}", "-h100000"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    lateness: list[tuple[int, int]] = []
-    for line in done.stdout.splitlines():
-        words = line.split()
-        if len(words) == 2 and words[0].isdigit() and words[1].isdigit():
-            lateness.append((int(words[0]), int(words[1])))
-    if done.returncode or not lateness:
-        return None
-    values, counts = zip(*lateness, strict=True)
-    return np.repeat(np.array(values, dtype=np.int64) * 1000, counts)
+    command = [
+        program,
+        "-q",
+        "--policy=other",
+        "--default-system",
+        "-t1",
+        f"-i{period_us}",
+        f"-l{loops}",
+        f"-h{_HISTOGRAM_US}",
+    ]
+    clock = MonotonicClock()
+    begun_ns = clock.now_ns()
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, start_new_session=True
+    ) as process:
+        try:
+            while True:
+                stop.check()
+                try:
+                    said, _ = process.communicate(timeout=_LOOK_S)
+                    break
+                except subprocess.TimeoutExpired:
+                    told(min(loops, round((clock.now_ns() - begun_ns) * 1e-9 * rate_hz)))
+        finally:
+            process.kill()
+    return None if process.returncode else lateness_of(said)
+
+
+def lateness_of(said: str) -> npt.NDArray[np.int64] | None:
+    """Lateness (n,) ns in the histogram that cyclictest printed; what did not fit into it counts as its maximum."""
+    values, counts = [], []
+    for line in said.splitlines():
+        if found := re.fullmatch(r"(\d+)\s+(\d+)", line.strip()):
+            values.append(int(found[1]))
+            counts.append(int(found[2]))
+    most, beyond = (re.search(rf"# {name}:\s*(\d+)", said) for name in ("Max Latencies", "Histogram Overflows"))
+    if most and beyond:
+        values.append(int(most[1]))
+        counts.append(int(beyond[1]))
+    lateness = np.repeat(np.array(values, dtype=np.int64) * 1000, np.array(counts, dtype=np.int64))
+    return lateness if len(lateness) else None

@@ -11,9 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from bridge.process import StopFlag
-from fwav_hil.latency.analysis import LEGS, Legs, clock_check, join_legs
+from bridge.summary import read_json
+from fwav_hil.latency.analysis import LEGS, Legs, clock_check
 from fwav_hil.latency.histogram import percentiles, write_hgrm
 from fwav_hil.latency.peers import cyclictest, probe_echo, probe_mavutil, probe_responder
+from fwav_hil.report import FILES, summarise
 from fwav_hil.run import RunOptions, run
 from fwav_hil.score import scores
 from fwav_hil.simulate import Simulation, simulate
@@ -22,7 +24,7 @@ from protocol.scenario import NANOSECONDS, Delay, Scenario
 Told = Callable[[str, float], None]
 """Hears what is being done, and the share of it that is done."""
 
-PROBE_SECONDS = 5.0
+LONGEST_PROBING_S = 5.0
 MISSING_CYCLICTEST = "cyclictest was not found or refused to run: install it with `apt-get install rt-tests`"
 
 
@@ -53,12 +55,13 @@ def losses(summary: dict[str, Any]) -> dict[str, int]:
     Where no sample comes in time the controller gives its last answer again, the same frame (`repeated`): that is no
     duplicate of the link, and not out of order.
     """
-    emulator, controller = summary["counters"]["emulator"], summary["counters"]["controller"]
+    counters = summary.get("counters", {})
+    emulator, controller = counters.get("emulator", {}), counters.get("controller", {})
     repeated = controller.get("repeated", 0)
     return {
         "lost": emulator.get("sequence_gaps", 0) + controller.get("sequence_gaps", 0),
-        "duplicate": max(0, emulator.get("repeated", 0) + emulator.get("old_commands", 0) - repeated),
-        "out_of_order": controller.get("out_of_order", 0),
+        "duplicate": max(0, emulator.get("repeated", 0) - repeated),
+        "out_of_order": emulator.get("old_commands", 0) + controller.get("out_of_order", 0),
         "repeated": repeated,
         "unanswered_in_period": emulator.get("unanswered", 0),
         "missed_deadlines": emulator.get("late", 0),
@@ -70,14 +73,17 @@ def prediction(scenario: Scenario, legs: Legs, summary: dict[str, Any]) -> dict[
     """The tracking error that `simulate` predicts, beside the run's: RMSE by axis.
 
     `constant`: every command delayed by the median age. `recorded`: each by its own delay in the run, in simulation time;
-    a command that did not come never acts.
+    a command that did not come never acts. Both are as long as the run was. None of a simulation that diverged.
     """
-    if not len(legs.t_ns):
+    flown = np.arange(summary.get("ticks", 0)) * scenario.period_ns
+    answered = np.isin(legs.t_ns, flown)
+    if not answered.any():
         return None
-    median_s = float(np.median(legs.delay_ns)) / NANOSECONDS
+    scenario = msgspec.structs.replace(scenario, duration_s=len(flown) * scenario.period_ns / NANOSECONDS)
+    median_s = float(np.median(legs.delay_ns[answered])) / NANOSECONDS
     delayed = msgspec.structs.replace(scenario, delay=Delay(samples=0, seconds=median_s))
     delays_ns = np.full(scenario.ticks, -1, dtype=np.int64)
-    delays_ns[legs.t_ns // scenario.period_ns] = legs.delay_ns
+    delays_ns[legs.t_ns[answered] // scenario.period_ns] = legs.delay_ns[answered]
     return {
         "delay_s": median_s,
         "rmse_run": summary["rmse"],
@@ -86,17 +92,20 @@ def prediction(scenario: Scenario, legs: Legs, summary: dict[str, Any]) -> dict[
     }
 
 
-def _rmse(scenario: Scenario, result: Simulation) -> dict[str, float | None]:
+def _rmse(scenario: Scenario, result: Simulation) -> dict[str, float | None] | None:
+    if result.divergence:
+        return None
     rmse: dict[str, float | None] = scores(scenario, result.t_ns, result.q)["rmse"]
     return rmse
 
 
-def beside(rate_hz: float, stop: StopFlag, told: Told, *, against: bool) -> dict[str, Any]:
+def beside(rate_hz: float, seconds: float, stop: StopFlag, told: Told, *, against: bool) -> dict[str, Any]:
     """Open-loop probes of our own responder and, if asked, of a bare echo and a mavutil script; and cyclictest's wake-ups.
 
-    Values are distributions in us, with the answers lost, doubled and out of order; a note where one could not run.
+    Values are distributions in us, with the answers lost, doubled, out of order and to no question; a note where one could
+    not run. Raises Interrupted.
     """
-    count = max(100, round(rate_hz * PROBE_SECONDS))
+    count = max(100, round(rate_hz * seconds))
     probes = {"open_loop": probe_responder}
     if against:
         probes |= {"bare_echo": probe_echo, "mavutil": probe_mavutil}
@@ -110,33 +119,42 @@ def beside(rate_hz: float, stop: StopFlag, told: Told, *, against: bool) -> dict
             "lost": result.lost,
             "duplicate": result.duplicates,
             "out_of_order": result.out_of_order,
+            "unknown": result.unknown,
         }
     if against:
-        told("cyclictest", 0.0)
-        lateness = cyclictest(rate_hz, PROBE_SECONDS)
+        lateness = cyclictest(
+            stop, rate_hz=rate_hz, seconds=count / rate_hz, told=lambda done: told("cyclictest", done / count)
+        )
         found["cyclictest"] = {"note": MISSING_CYCLICTEST} if lateness is None else {"wake": percentiles(lateness)}
     return found
 
 
-def report_of(
-    scenario: Scenario, summary: dict[str, Any], folder: Path, controller_folder: Path | None = None
-) -> tuple[dict[str, Any], Legs]:
-    """The report of a run with time stamps, and its legs; on two machines by TIMESYNC. Raises RunFolderError."""
-    legs = join_legs(folder, controller_folder)
-    if controller_folder and legs.clock:
-        legs = join_legs(folder, controller_folder, offset_ns=legs.clock.offset_ns)
-    report = {
+def summary_of(folder: Path, controller_folder: Path | None = None) -> dict[str, Any]:
+    """The summary of a run folder, made where there is none yet (an emulator alone writes none), with the counters of both.
+
+    Raises RunFolderError, ScenarioError.
+    """
+    summary = read_json(folder / FILES["summary"]) or summarise(folder)
+    if controller_folder:
+        theirs = read_json(controller_folder / FILES["controller"]).get("counters", {})
+        summary["counters"] = {**summary.get("counters", {}), "controller": theirs}
+    return summary
+
+
+def report_of(scenario: Scenario, summary: dict[str, Any], legs: Legs, *, two_clocks: bool = False) -> dict[str, Any]:
+    """The report of a run with time stamps; two_clocks: TIMESYNC joined its legs, and there is nothing to check it by."""
+    return {
         "scenario": scenario.name,
         "law": scenario.law,
         "rate_hz": scenario.rate_hz,
         "duration_s": scenario.duration_s,
         "legs_us": leg_report(legs),
         "losses": losses(summary),
-        "time_sync": clock_check(legs) if controller_folder is None else _offset_of(legs),
+        "negative_legs": legs.negative,
+        "time_sync": _offset_of(legs) if two_clocks else clock_check(legs),
         "prediction": prediction(scenario, legs, summary),
         "placement": summary.get("placement", ""),
     }
-    return report, legs
 
 
 def _offset_of(legs: Legs) -> dict[str, Any] | None:

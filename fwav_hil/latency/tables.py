@@ -21,18 +21,24 @@ def print_report(result: dict[str, Any], console: Console) -> None:
     title = f"{result['scenario']}, law {result['law']}, {result['rate_hz']:g} Hz, real time; us"
     console.print(_table(title, {LEGS[name]: figures for name, figures in result["legs_us"].items()}))
     console.print(", ".join(f"{name.replace('_', ' ')} {count}" for name, count in result["losses"].items()))
-    if sync := result["time_sync"]:
-        if "error_us" in sync:
-            judged = "within" if sync["held"] else "BEYOND"
-            console.print(
-                f"TIMESYNC: offset off by {sync['error_us']:.1f} us from the shared clock, {judged} its bound of "
-                f"{sync['bound_us']:.1f} us (half the round trip), {sync['answers']} answers"
-            )
-        else:
-            console.print(
-                f"TIMESYNC: the controller's clock is ahead by {sync['offset_us']:.1f} us, within {sync['bound_us']:.1f} us; "
-                "legs between the machines are that uncertain"
-            )
+    if result["negative_legs"]:
+        console.print(
+            f"{result['negative_legs']} durations came out negative and count as 0: the clocks are that uncertain"
+        )
+    sync = result["time_sync"]
+    if sync is None:
+        console.print("TIMESYNC: no answer came; where the ends have two clocks, the legs between them are not known")
+    elif "error_us" in sync:
+        judged = "within" if sync["held"] else "BEYOND"
+        console.print(
+            f"TIMESYNC: offset off by {sync['error_us']:.1f} us from the shared clock, {judged} its bound of "
+            f"{sync['bound_us']:.1f} us (half the round trip), {sync['answers']} answers"
+        )
+    else:
+        console.print(
+            f"TIMESYNC: the controller's clock is ahead by {sync['offset_us']:.1f} us, within {sync['bound_us']:.1f} us; "
+            "legs between the machines are that uncertain"
+        )
     if beside := result["beside"]:
         rows = {
             f"round trip, {name.replace('_', ' ')}": found["from_due"]
@@ -42,12 +48,16 @@ def print_report(result: dict[str, Any], console: Console) -> None:
         if "wake" in beside.get("cyclictest", {}):
             rows["wake-up, cyclictest"] = beside["cyclictest"]["wake"]
         console.print(_table("beside it, one after the other, each from when it was due; us", rows))
+        for name, found in beside.items():
+            gone = {key: found[key] for key in ("lost", "duplicate", "out_of_order", "unknown") if found.get(key)}
+            if gone:
+                told = ", ".join(f"{key.replace('_', ' ')} {number}" for key, number in gone.items())
+                console.print(f"{name.replace('_', ' ')}: {told}")
         if "note" in beside.get("cyclictest", {}):
             console.print(beside["cyclictest"]["note"])
     if predicted := result["prediction"]:
         cells = ", ".join(
-            f"{axis} " + " / ".join(show_error(axis, predicted[f"rmse_{which}"][axis]) for which in RMSE)
-            for axis in AXES
+            f"{axis} " + " / ".join(_show_error(axis, predicted[f"rmse_{which}"]) for which in RMSE) for axis in AXES
         )
         console.print(
             f"RMSE of the run / simulated with a constant delay of {1e3 * predicted['delay_s']:.3f} ms (the median) / with "
@@ -59,7 +69,10 @@ def print_probes(result: dict[str, Any], console: Console) -> None:
     """Probes of a link by TIMESYNC."""
     rows = {"round trip from when due": result["round_trip_us"], "round trip from when sent": result["from_sent_us"]}
     console.print(_table(f"TIMESYNC on {result['link']} at {result['rate_hz']:g} Hz; us", rows))
-    console.print(f"lost {result['lost']}, duplicate {result['duplicate']}, out of order {result['out_of_order']}")
+    console.print(
+        f"lost {result['lost']}, duplicate {result['duplicate']}, out of order {result['out_of_order']}, "
+        f"to no question {result['unknown']}"
+    )
     console.print(
         f"the other clock is ahead by {result['clock_offset_us']:.1f} us, within {result['clock_offset_bound_us']:.1f} us"
     )
@@ -74,6 +87,10 @@ def _table(title: str, rows: dict[str, dict[str, float | int | None]]) -> Table:
     for name, figures in rows.items():
         table.add_row(name, str(figures["count"]), *(_show(figures[column]) for column in COLUMNS))
     return table
+
+
+def _show_error(axis: str, rmse: dict[str, float | None] | None) -> str:
+    return "diverged" if rmse is None else show_error(axis, rmse[axis])
 
 
 def _show(value: float | None) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from controller.laws import make_law
@@ -16,6 +17,7 @@ from plant_emulator.integrate import PENDING, Plant
 from plant_emulator.safety import SafetyEnvelope
 from plant_emulator.sensors import PositionSensor
 from protocol import mavlink_map
+from protocol.errors import UsageError
 from protocol.messages import ActuatorCommand, FloatArray
 from protocol.scenario import Delay, Noise, Play, Scenario, find_scenario, load_scenario
 
@@ -132,6 +134,47 @@ def test_a_command_acts_when_its_delay_is_over(delay: Delay, late: int) -> None:
     allowed = np.clip(run.command, FLAPPER.actuators.lower, FLAPPER.actuators.upper)
     assert run.tau[late:].tobytes() == allowed[: len(allowed) - late].tobytes()
     assert run.tau[:late].tolist() == [list(FLAPPER.initial.command)] * late
+
+
+class TestGivenDelays:
+    """A delay for each command, in place of the scenario's."""
+
+    SHORT = replaced(FLAPPER, duration_s=0.4)
+
+    def delays(self, value_ns: int) -> npt.NDArray[np.int64]:
+        return np.full(self.SHORT.ticks, value_ns)
+
+    @pytest.mark.parametrize("delay", [Delay(), Delay(samples=1, seconds=0.005), Delay(seconds=0.0123)])
+    def test_one_delay_for_all_is_the_scenarios_to_the_bit(self, delay: Delay) -> None:
+        scenario = replaced(self.SHORT, delay=delay)
+        assert same_bytes(simulate(scenario), simulate(self.SHORT, delays_ns=self.delays(scenario.delay_ns)))
+
+    def test_a_command_below_zero_never_acts(self) -> None:
+        delays_ns = self.delays(0)
+        delays_ns[40:43] = -1
+        run = simulate(self.SHORT, delays_ns=delays_ns)
+        allowed = np.clip(run.command, FLAPPER.actuators.lower, FLAPPER.actuators.upper)
+        allowed[40:43] = allowed[39]
+        assert run.tau.tobytes() == allowed.tobytes()
+
+    def test_where_none_acts_the_initial_command_stands(self) -> None:
+        run = simulate(replaced(self.SHORT, duration_s=0.02), delays_ns=np.full(5, -1))
+        assert run.tau.tolist() == [list(FLAPPER.initial.command)] * 5
+
+    def test_no_command_overtakes_the_one_before_it(self) -> None:
+        """Command 40 comes three periods late, so those after it wait for it: then the newest of them acts."""
+        delays_ns = self.delays(0)
+        delays_ns[40] = 3 * self.SHORT.period_ns
+        run = simulate(self.SHORT, delays_ns=delays_ns)
+        allowed = np.clip(run.command, FLAPPER.actuators.lower, FLAPPER.actuators.upper)
+        allowed[40:43] = allowed[39]
+        assert run.tau.tobytes() == allowed.tobytes()
+
+    @pytest.mark.parametrize("shape", [(99,), (101,), (0,), (100, 1)])
+    def test_another_number_of_delays_than_ticks_is_refused(self, shape: tuple[int, ...]) -> None:
+        assert self.SHORT.ticks == 100
+        with pytest.raises(UsageError, match="100 ticks"):
+            simulate(self.SHORT, delays_ns=np.zeros(shape, dtype=np.int64))
 
 
 @pytest.mark.parametrize("hysteresis", [FLAPPER.hysteresis, Play(h=(1.1,) * 6, B=(0.001,) * 3 + (2e-6,) * 3)])

@@ -1,0 +1,37 @@
+"""The bare echo, as a process: a tick's bytes there, a command's back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bridge.link import open_link
+from fwav_hil.latency.echo import COMMAND_BYTES, TICK_BYTES
+from fwav_hil.latency.peers import EMULATOR, _child
+from protocol import mavlink_map
+from protocol.mavlink_codec import FrameWriter
+from protocol.messages import ActuatorCommand
+from protocol.tick_frames import CommandWriter, TickWriter
+from tests.contracts.link_contract import receive
+from tests.loop import scenario_of
+
+
+@pytest.mark.processes
+def test_it_gives_back_the_first_bytes() -> None:
+    with _child("fwav_hil.latency.echo") as port, open_link(f"udpout://127.0.0.1:{port}") as link:
+        for number in range(3):
+            question = bytes([number]) + bytes(range(125))
+            link.send(question)
+            assert receive(link) == question[:COMMAND_BYTES]
+
+
+def test_the_sizes_are_those_of_a_tick_and_its_command() -> None:
+    scenario = scenario_of("flapper")
+    ticks = TickWriter(FrameWriter(*EMULATOR))
+    tick = ticks.frames(4_000_000, np.full(6, 0.123), np.full(13, 9.81))
+    scale = np.array(scenario.actuators.scale)
+    commands = CommandWriter(FrameWriter(1, 1), scale, lockstep=False)
+    command = commands.frame(ActuatorCommand(4_000_000, 0.3 * scale, armed=True))
+    assert mavlink_map.COMMAND.message_id == 93
+    assert len(command) == COMMAND_BYTES
+    assert sum(map(len, tick)) == TICK_BYTES
