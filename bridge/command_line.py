@@ -90,7 +90,7 @@ legs_option = click.option(
 )  # fmt: skip
 realtime_option = click.option(
     "--realtime", is_flag=True,
-    help="With --clock realtime: ask for SCHED_FIFO, locked memory, a core of its own, no deep idle states, timer slack "
+    help="In real time: ask for SCHED_FIFO, locked memory, a core of its own, no deep idle states, timer slack "
     "1 ns, no garbage collection, and poll the end of each wait; what the system refuses is said.",
 )  # fmt: skip
 trigger_option = click.option(

@@ -17,6 +17,7 @@ from bridge.command_line import (
     law_option,
     options,
     rate_option,
+    realtime_option,
     scenario_argument,
     seed_option,
     wait_option,
@@ -49,7 +50,7 @@ Example:
         "--link", default=FREE_PORT, show_default=True, metavar="URI",
         help="udpin:// or tcpin://: fly the closed loop on it. Any other link: ask whoever is there, by TIMESYNC.",
     ),
-    delay_option,
+    delay_option, realtime_option,
     click.option("--against", is_flag=True, help="Measure a bare UDP echo, a mavutil script and cyclictest beside it."),
     click.option(
         "--from", "folder", type=click.Path(exists=True, file_okay=False, path_type=Path), metavar="DIR",
@@ -68,8 +69,8 @@ Example:
 @click.pass_context
 def latency(
     context: click.Context, scenario: str, law: str | None, rate: float | None, duration: float | None, seed: int | None,
-    link: str, delay_ns: int, against: bool, folder: Path | None, controller_folder: Path | None, out: Path | None,
-    wait_s: float, json_path: Path | None,
+    link: str, delay_ns: int, realtime: bool, against: bool, folder: Path | None, controller_folder: Path | None,
+    out: Path | None, wait_s: float, json_path: Path | None,
 ) -> None:  # fmt: skip
     """Measure where the time goes between a sample and its command, in the real-time closed loop or on a real link."""
     from rich.console import Console
@@ -106,7 +107,7 @@ def latency(
     compile_kernels(chosen)
     folder = new_folder(chosen, out)
     try:
-        closed_loop(chosen, folder, link=link, delay_ns=delay_ns, wait_s=wait_s)
+        closed_loop(chosen, folder, link=link, delay_ns=delay_ns, wait_s=wait_s, realtime=realtime)
     except FwavHilError:
         # The run's own error is the one to end with; what there is of it is reported all the same.
         with contextlib.suppress(FwavHilError):

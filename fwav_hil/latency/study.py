@@ -28,9 +28,12 @@ LONGEST_PROBING_S = 5.0
 MISSING_CYCLICTEST = "cyclictest was not found or refused to run: install it with `apt-get install rt-tests`"
 
 
-def closed_loop(scenario: Scenario, folder: Path, *, link: str, delay_ns: int, wait_s: float) -> dict[str, Any]:
+def closed_loop(
+    scenario: Scenario, folder: Path, *, link: str, delay_ns: int, wait_s: float, realtime: bool
+) -> dict[str, Any]:
     """Fly the scenario in real time with time stamps; returns the run's summary. Raises what `run` raises."""
-    return run(scenario, folder, RunOptions(clock="realtime", link=link, wait_s=wait_s, delay_ns=delay_ns, legs=True))
+    how = RunOptions(clock="realtime", link=link, wait_s=wait_s, delay_ns=delay_ns, legs=True, realtime=realtime)
+    return run(scenario, folder, how)
 
 
 def leg_report(legs: Legs) -> dict[str, dict[str, float | int | None]]:
