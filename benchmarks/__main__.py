@@ -9,77 +9,28 @@ import argparse
 import json
 import os
 import platform
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from benchmarks.codec import codec
-from benchmarks.ping_pong import round_trip_us
+from benchmarks.loop import lockstep_tick, simulated_steps
 from benchmarks.processor import processor_time
+from benchmarks.row import ALTERNATIONS
 from benchmarks.start import start
 from benchmarks.wake_up import wake_up_lateness
 from fwav_hil.compile import compile_kernels
-from fwav_hil.simulate import simulate
-from protocol.scenario import find_scenario, load_scenario, with_overrides
+from protocol.scenario import find_scenario, load_scenario
 
 HERE = Path(__file__).parent
-ALTERNATIONS = 3
-TICK_BAR_US = 100.0
-SIMULATE_BAR = 300_000.0
-
-
-def lockstep_tick() -> dict[str, Any]:
-    """A whole lockstep tick (out, back, stepped, recorded), median, against the bare ping-pong of the same bytes."""
-    cores = sorted(os.sched_getaffinity(0))
-    poll = len(cores) > 1
-    best = (float("inf"), float("inf"))
-    for _ in range(ALTERNATIONS):
-        anchor = round_trip_us((cores[-1], cores[-2] if poll else cores[-1]), poll=poll)
-        with tempfile.TemporaryDirectory() as folder:
-            result = Path(folder) / "result.json"
-            command = [sys.executable, "-m", "fwav_hil", "run", "paper", "--link", "udpin://127.0.0.1:0", "--no-plots"]
-            command += ["--out", folder + "/run", "--json", str(result)]
-            subprocess.run(command, check=True, capture_output=True)
-            best = min(best, (json.loads(result.read_text())["tick_us"]["p50"], anchor))
-    return _row(
-        best[0], "us", "bare UDP ping-pong, same placement", best[1], f"<= {TICK_BAR_US:g} us", best[0] <= TICK_BAR_US
-    )
-
-
-def simulated_steps() -> dict[str, Any]:
-    """Closed-loop control steps a second: 1 kHz control, 4 plant sub-steps, the arrays of the run recorded; one core."""
-    scenario = with_overrides(load_scenario(find_scenario("paper")), duration_s=100.0)
-    simulate(scenario)
-    rates = []
-    for _ in range(2 * ALTERNATIONS):
-        begun = time.perf_counter()
-        simulate(scenario)
-        rates.append(scenario.ticks / (time.perf_counter() - begun))
-    best = max(rates)
-    return _row(best, "steps/s", "real time", scenario.rate_hz, f">= {SIMULATE_BAR:g} steps/s", best >= SIMULATE_BAR)
-
-
-def _row(value: float, unit: str, anchor: str, anchor_value: float, bar: str, ok: bool) -> dict[str, Any]:
-    return {
-        "value": value,
-        "unit": unit,
-        "anchor": anchor,
-        "anchor_value": anchor_value,
-        "ratio": value / anchor_value,
-        "bar": bar,
-        "ok": ok,
-    }
-
 
 BENCHMARKS: dict[str, Callable[[argparse.Namespace], dict[str, dict[str, Any]]]] = {
-    "lockstep_tick": lambda _given: {"lockstep_tick": lockstep_tick()},
+    "lockstep_tick": lambda _given: lockstep_tick(),
     "wake_up": lambda given: wake_up_lateness(given.wake_up_seconds),
     "codec": lambda _given: codec(),
-    "simulated_steps": lambda _given: {"simulated_steps": simulated_steps()},
+    "simulated_steps": lambda given: simulated_steps(given.rotorpy_python),
     "processor": lambda _given: processor_time(),
     "start": lambda _given: start(),
 }
@@ -91,6 +42,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Benchmarks; without names, all of them.")
     parser.add_argument("names", nargs="*", choices=[*BENCHMARKS, []], metavar="NAME", help=", ".join(BENCHMARKS))
     parser.add_argument("--wake-up-seconds", type=float, default=10.0, help="length of a turn of wake_up (default 10)")
+    parser.add_argument(
+        "--rotorpy-python", default=sys.executable, help="a Python that has RotorPy (default: this one)"
+    )
     given = parser.parse_args()
     compile_kernels(load_scenario(find_scenario("paper")))
     written = HERE / "results.json"
