@@ -33,6 +33,8 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> Ended:
 
 def test_of_the_flapper(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setattr(margin_study, "VARIANTS", margin_study.VARIANTS[-1:])
+    monkeypatch.setattr(margin_study, "_REGION_DELAYS", 12)
     out = tmp_path / "study"
     ended = call(capsys, "flapper", "--out", str(out), "--json", "-")
     assert ended.code == 0, ended.err
