@@ -10,7 +10,7 @@ import pytest
 
 from bridge.command_line import run_command
 from fwav_hil.cli import cli
-from fwav_hil.studies import margin_study
+from fwav_hil.studies import flight_check, margin_study
 from fwav_hil.studies.margin import RATES_HZ, at_rate, linear_margins, with_derivative_pole, with_gain_ratio
 from protocol.messages import AXES
 from tests.loop import scenario_of
@@ -33,6 +33,8 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> Ended:
 
 def test_of_the_flapper(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setattr(margin_study, "VARIANTS", flight_check.VARIANTS[-1:])
+    monkeypatch.setattr(margin_study, "_REGION_DELAYS", 12)
     out = tmp_path / "study"
     ended = call(capsys, "flapper", "--out", str(out), "--json", "-")
     assert ended.code == 0, ended.err
