@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -15,7 +17,9 @@ from bridge.clock import MonotonicClock
 from bridge.endpoint import VEHICLE, Endpoint
 from bridge.link import Link
 from bridge.memory import memory_pair
+from bridge.probes import ProbeResult
 from bridge.process import StopFlag
+from bridge.timesync import Estimate
 from fwav_hil.latency import peers
 from fwav_hil.latency.peers import (
     cyclictest,
@@ -38,7 +42,7 @@ def untold(_sent: int) -> None:
 
 @pytest.mark.processes
 @pytest.mark.parametrize("ask", [probe_responder, probe_echo, probe_mavutil])
-def test_each_peer_answers(ask: Callable[..., peers.ProbeResult]) -> None:
+def test_each_peer_answers(ask: Callable[..., ProbeResult]) -> None:
     result = ask(StopFlag(), rate_hz=200.0, count=40, told=untold)
     assert len(result.from_due_ns) == 40
     assert (result.duplicates, result.out_of_order, result.unknown) == (0, 0, 0)
@@ -76,7 +80,7 @@ def reply(endpoint: Endpoint, frame: Frame, *, ahead_ns: int = 0, asked_ns: int 
     return endpoint.seal(mavlink_map.TIMESYNC, payload)
 
 
-def ask(link: Link, count: int = 10) -> tuple[peers.ProbeResult, peers.Estimate | None]:
+def ask(link: Link, count: int = 10) -> tuple[ProbeResult, Estimate | None]:
     return probe_time_sync(link, StopFlag(), rate_hz=500.0, count=count, told=untold)
 
 
@@ -146,7 +150,7 @@ class TestTimeSync:
 
 
 def test_a_child_that_does_not_start_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(peers.sys, "executable", "/bin/true")
+    monkeypatch.setattr(sys, "executable", "/bin/true")
     with pytest.raises(PeerMissingError, match="python -m nobody"), peers._child("nobody"):
         pass
 
@@ -179,7 +183,7 @@ class TestCyclictest:
         path = tmp_path / "cyclictest"
         path.write_text(f"#!/bin/sh\n{program}")
         path.chmod(0o755)
-        monkeypatch.setattr(peers.shutil, "which", lambda _: str(path))
+        monkeypatch.setattr(shutil, "which", lambda _: str(path))
         found = cyclictest(stop, rate_hz=1000.0, seconds=0.1, told=untold)
         return None if found is None else found.tolist()
 
@@ -200,8 +204,8 @@ class TestCyclictest:
         assert clock.now_ns() - begun_ns < 30 * 10**9
 
     def test_it_is_nothing_where_it_is_not_installed(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(peers.shutil, "which", lambda _: None)
-        monkeypatch.setattr(peers.Path, "exists", lambda _: False)
+        monkeypatch.setattr(shutil, "which", lambda _: None)
+        monkeypatch.setattr(Path, "exists", lambda _: False)
         monkeypatch.setattr(subprocess, "Popen", None)
         assert cyclictest(StopFlag(), rate_hz=1000.0, seconds=0.1, told=untold) is None
 
