@@ -20,6 +20,7 @@ from typing import Any
 from benchmarks.codec import codec
 from benchmarks.ping_pong import round_trip_us
 from benchmarks.processor import processor_time
+from benchmarks.read_log import read_log
 from benchmarks.start import start
 from benchmarks.wake_up import wake_up_lateness
 from fwav_hil.compile import compile_kernels
@@ -82,6 +83,7 @@ BENCHMARKS: dict[str, Callable[[argparse.Namespace], dict[str, dict[str, Any]]]]
     "simulated_steps": lambda _given: {"simulated_steps": simulated_steps()},
     "processor": lambda _given: processor_time(),
     "start": lambda _given: start(),
+    "read_log": lambda _given: read_log(),
 }
 """By the name one calls it with: what it gives, by the names of its rows."""
 
