@@ -18,6 +18,7 @@ from typing import Any
 from benchmarks.codec import codec
 from benchmarks.loop import lockstep_tick, simulated_steps
 from benchmarks.processor import processor_time
+from benchmarks.read_log import read_log
 from benchmarks.row import ALTERNATIONS
 from benchmarks.start import start
 from benchmarks.wake_up import wake_up_lateness
@@ -33,6 +34,7 @@ BENCHMARKS: dict[str, Callable[[argparse.Namespace], dict[str, dict[str, Any]]]]
     "simulated_steps": lambda given: simulated_steps(given.rotorpy_python),
     "processor": lambda _given: processor_time(),
     "start": lambda _given: start(),
+    "read_log": lambda _given: read_log(),
 }
 """By the name one calls it with: what it gives, by the names of its rows."""
 

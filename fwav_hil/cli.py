@@ -92,7 +92,7 @@ def cli() -> None:
 
     \b
     Exit codes: 0 done, 2 wrong argument or scenario, 3 link, 4 the other end, 5 the flight diverged, 6 results cannot
-    be written, 130 interrupted.
+    be written or a log not read, 130 interrupted.
     """
 
 

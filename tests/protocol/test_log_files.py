@@ -117,7 +117,7 @@ def px4_log() -> bytes:
         data += ulog_message("A", struct.pack("<BH", instance, number) + name)
     for row in range(10):
         for number in (0, 1):
-            body = struct.pack("<HQfffffB3x", number, 1000 + 4000 * row, 1, 0, 0, row, 0.5 * row, number)
+            body = struct.pack("<HQfffffB", number, 1000 + 4000 * row, 1, 0, 0, row, 0.5 * row, number)
             data += ulog_message("D", body)
         if row % 5 == 0:
             data += ulog_message("D", struct.pack("<HQB", 2, 1001 + 4000 * row, row > 0))

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import random
 import resource
 import struct
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from protocol.errors import RunFolderError
-from protocol.mavlink_codec import FrameWriter, layout
+from protocol.mavlink_codec import FrameWriter, layout, layouts_by_id
 from protocol.streams import STREAMS
 from protocol.tlog import TlogWriter, read_tlog
 
@@ -227,3 +230,14 @@ class TestWriting:
         _write(tmp_path / "a.tlog", RECORDS)
         _write(tmp_path / "a.tlog", RECORDS[:2])
         assert _read(tmp_path / "a.tlog") == RECORDS[:2]
+
+
+def test_mavlogdump_prints_every_record(tmp_path: Path) -> None:
+    _write(tmp_path / "a.tlog", [(1_700_000_000_000_000 + t_us, frame) for t_us, frame in RECORDS])
+    environment = {**os.environ, "MAVLINK20": "1", "TZ": "UTC"}
+    command = [sys.executable, "-m", "pymavlink.tools.mavlogdump", "--dialect", "common", str(tmp_path / "a.tlog")]
+    ended = subprocess.run(command, env=environment, capture_output=True, check=True)
+    lines = ended.stdout.splitlines()
+    names = [f.message_id for _, f in read_tlog(tmp_path / "a.tlog")]
+    assert [line.split()[2].rstrip(b":").decode() for line in lines] == [layouts_by_id()[n].name for n in names]
+    assert lines[0].startswith(b"2023-11-14 22:13:20.00: ")
