@@ -14,6 +14,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from protocol.compiled import compiled
+
 LONGEST_DATA = 8
 STANDARD_IDS = 1 << 11
 EXTENDED_IDS = 1 << 29
@@ -49,40 +51,62 @@ def worst_bits(length: int, *, extended: bool) -> int:
 
 def exact_bits(frame: CanFrame) -> int:
     """Bits that just this frame takes, stuffing counted, the gap to the next frame included."""
-    bits = _header(frame) + [byte >> (7 - i) & 1 for byte in frame.data for i in range(8)]
-    crc = crc15(bits)
-    bits += [crc >> (14 - i) & 1 for i in range(15)]
-    return len(bits) + _stuffing(bits) + _UNSTUFFED_TAIL
+    data = frame.data.ljust(LONGEST_DATA, b"\0")
+    high, low = int.from_bytes(data[:4], "big"), int.from_bytes(data[4:], "big")
+    return int(_bits_on_the_wire(frame.can_id, frame.extended, frame.remote, len(frame.data), high, low))
 
 
-def crc15(bits: list[int]) -> int:
-    """CRC of a sequence of bits as CAN computes it: x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1, start 0."""
+@compiled
+def _bits_on_the_wire(can_id: int, extended: bool, remote: bool, length: int, high: int, low: int) -> int:
+    """`exact_bits`; the data as two halves of 32 bits, the first byte highest. Checksum and stuffing go bit by bit."""
+    header = 39 if extended else 19
+    total = header + 8 * length + 15
     crc = 0
-    for bit in bits:
-        high = crc >> 14 & 1
-        crc = crc << 1 & 0x7FFF
-        if high != bit:
-            crc ^= _CRC_POLYNOMIAL
-    return crc
-
-
-def _header(frame: CanFrame) -> list[int]:
-    remote, length = int(frame.remote), len(frame.data)
-    if frame.extended:
-        base, rest = frame.can_id >> 18, frame.can_id & 0x3FFFF
-        fields = [(0, 1), (base, 11), (0b11, 2), (rest, 18), (remote, 1), (0, 2), (length, 4)]
-    else:
-        fields = [(0, 1), (frame.can_id, 11), (remote, 1), (0, 2), (length, 4)]
-    return [value >> (width - 1 - i) & 1 for value, width in fields for i in range(width)]
-
-
-def _stuffing(bits: list[int]) -> int:
-    """Stuff bits that a sequence gets; a stuff bit itself begins the next run."""
-    stuffed, last, run = 0, -1, 0
-    for bit in bits:
+    last, run, stuffed = -1, 0, 0
+    for at in range(total):
+        if at < header:
+            bit = _extended_bit(can_id, remote, length, at) if extended else _standard_bit(can_id, remote, length, at)
+        elif at < total - 15:
+            place = at - header
+            bit = (high >> (31 - place) if place < 32 else low >> (63 - place)) & 1
+        else:
+            bit = crc >> (total - 1 - at) & 1
+        if at < total - 15:
+            feedback = (crc >> 14 & 1) != bit
+            crc = crc << 1 & 0x7FFF
+            if feedback:
+                crc ^= _CRC_POLYNOMIAL
         run = run + 1 if bit == last else 1
         last = bit
-        if run == _RUN:
+        if run == _RUN:  # the stuff bit itself begins the next run
             stuffed += 1
             last, run = 1 - bit, 1
-    return stuffed
+    return total + stuffed + _UNSTUFFED_TAIL
+
+
+@compiled
+def _standard_bit(can_id: int, remote: bool, length: int, at: int) -> int:
+    """Start, identifier (11), remote, two zeros, length (4)."""
+    if 1 <= at < 12:
+        return can_id >> (11 - at) & 1
+    if at == 12:
+        return 1 if remote else 0
+    if at >= 15:
+        return length >> (18 - at) & 1
+    return 0
+
+
+@compiled
+def _extended_bit(can_id: int, remote: bool, length: int, at: int) -> int:
+    """Start, identifier (11), two ones, identifier (18), remote, two zeros, length (4)."""
+    if 1 <= at < 12:
+        return can_id >> (29 - at) & 1
+    if at in (12, 13):
+        return 1
+    if 14 <= at < 32:
+        return can_id >> (31 - at) & 1
+    if at == 32:
+        return 1 if remote else 0
+    if at >= 35:
+        return length >> (38 - at) & 1
+    return 0

@@ -243,9 +243,9 @@ def traffic(motor: Motor, rate_hz: float) -> list[Traffic]:
     status = MEDIUM << 24 | ESC_STATUS << 8 | motor.first_node_id
     node = LOW << 24 | NODE_STATUS << 8 | motor.first_node_id
     return [
-        Traffic("RawCommand", raw, 8, rate_hz, 1, extended=True),
-        Traffic("RawCommand, end", raw, 7, rate_hz, 1, extended=True),
-        Traffic("Status", status, 8, motor.status_rate_hz, 2 * DRIVES, extended=True),
+        Traffic("RawCommand", raw, 8, rate_hz, 1, extended=True, command=True),
+        Traffic("RawCommand, end", raw, 7, rate_hz, 1, extended=True, command=True),
+        Traffic("Status", status, 8, motor.status_rate_hz, 2 * DRIVES, extended=True, step=0),
         Traffic("Status, end", status, 3, motor.status_rate_hz, DRIVES, extended=True),
         Traffic("NodeStatus", node, 8, NODE_STATUS_RATE_HZ, DRIVES + 1, extended=True),
     ]

@@ -186,6 +186,6 @@ def _check_range(motor: Motor) -> None:
 def traffic(motor: Motor, rate_hz: float) -> list[Traffic]:
     """A command and a reply for each axis at rate_hz."""
     return [
-        Traffic("reply", MASTER, motor.mit_reply_bytes, rate_hz),
-        Traffic("command", motor.first_node_id, 8, rate_hz),
+        Traffic("reply", MASTER, motor.mit_reply_bytes, rate_hz, step=0),
+        Traffic("command", motor.first_node_id, 8, rate_hz, command=True),
     ]

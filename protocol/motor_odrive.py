@@ -202,11 +202,15 @@ def _errors(faults: Fault) -> int:
 def traffic(motor: Motor, rate_hz: float) -> list[Traffic]:
     """Commands at rate_hz, cyclic messages at their own rates."""
     first = motor.first_node_id << 5
+    kinds = (
+        ("Set_Input_Torque", SET_INPUT_TORQUE, 4, rate_hz),
+        ("Heartbeat", HEARTBEAT, 8, motor.heartbeat_rate_hz),
+        ("Get_Encoder_Estimates", GET_ENCODER_ESTIMATES, 8, motor.encoder_rate_hz),
+        ("Get_Iq", GET_IQ, 8, motor.status_rate_hz),
+        ("Get_Temperature", GET_TEMPERATURE, 8, motor.status_rate_hz),
+        ("Get_Bus_Voltage_Current", GET_BUS_VOLTAGE_CURRENT, 8, motor.status_rate_hz),
+    )
     return [
-        Traffic("Set_Input_Torque", first | SET_INPUT_TORQUE, 4, rate_hz),
-        Traffic("Heartbeat", first | HEARTBEAT, 8, motor.heartbeat_rate_hz),
-        Traffic("Get_Encoder_Estimates", first | GET_ENCODER_ESTIMATES, 8, motor.encoder_rate_hz),
-        Traffic("Get_Iq", first | GET_IQ, 8, motor.status_rate_hz),
-        Traffic("Get_Temperature", first | GET_TEMPERATURE, 8, motor.status_rate_hz),
-        Traffic("Get_Bus_Voltage_Current", first | GET_BUS_VOLTAGE_CURRENT, 8, motor.status_rate_hz),
+        Traffic(name, first | message, length, rate, step=1 << 5, command=message == SET_INPUT_TORQUE)
+        for name, message, length, rate in kinds
     ]

@@ -103,7 +103,11 @@ class Status(NamedTuple):
 
 
 class Traffic(NamedTuple):
-    """Frames of one kind on the bus: how many, of how many bytes, how often; `can_id` of the first decides who waits."""
+    """Frames of one kind on the bus: how many, of how many bytes, how often.
+
+    can_id   of the first; each further one has an identifier higher by `step`. Identifiers decide who waits for whom.
+    command  whether these frames carry the torques
+    """
 
     name: str
     can_id: int
@@ -111,6 +115,8 @@ class Traffic(NamedTuple):
     rate_hz: float
     number: int = DRIVES
     extended: bool = False
+    step: int = 1
+    command: bool = False
 
     @property
     def bits(self) -> int:

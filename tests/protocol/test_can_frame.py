@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol.can_frame import CanFrame, crc15, exact_bits, nominal_bits, worst_bits
+from protocol.can_frame import CanFrame, exact_bits, nominal_bits, worst_bits
 
 FRAMES = st.one_of(
     st.builds(CanFrame, st.integers(0, (1 << 11) - 1), st.binary(max_size=8)),
@@ -37,19 +37,34 @@ def test_exact_bits_lie_between(frame: CanFrame) -> None:
 
 def test_a_frame_counted_by_hand() -> None:
     """Identifier 0, no data: 19 zero bits and a CRC of 15 zeros: 34 equal bits get a stuff bit after the first five and
-    then, since each stuff bit breaks the run, after each five more: 6. So 47 + 6."""
-    assert crc15([0] * 19) == 0
+    then, since the stuff bit is a one and breaks the run, after each five more: 6. So 47 + 6."""
     assert exact_bits(CanFrame(0)) == 47 + 6
 
 
-@given(st.lists(st.integers(0, 1), max_size=90))
-def test_the_checksum_is_the_remainder_of_the_polynomial(bits: list[int]) -> None:
-    """Long division of the message times x^15 by x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1."""
+def written_out(frame: CanFrame) -> str:
+    """The stuffable bits as text: the checksum is the remainder of the message times x^15, by long division by
+    x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1."""
+    if frame.extended:
+        head = f"0{frame.can_id >> 18:011b}11{frame.can_id & 0x3FFFF:018b}{frame.remote:b}00"
+    else:
+        head = f"0{frame.can_id:011b}{frame.remote:b}00"
+    text = head + f"{len(frame.data):04b}" + "".join(f"{byte:08b}" for byte in frame.data)
     generator = sum(1 << power for power in (15, 14, 10, 8, 7, 4, 3, 0))
-    value = int("".join(map(str, bits)) or "0", 2) << 15
+    value = int(text, 2) << 15
     while value.bit_length() > 15:
         value ^= generator << (value.bit_length() - 16)
-    assert crc15(bits) == value
+    return text + f"{value:015b}"
+
+
+@given(FRAMES)
+def test_stuffing_is_that_of_the_bits_written_out(frame: CanFrame) -> None:
+    text = written_out(frame)
+    stuffed = ""
+    for bit in text:
+        stuffed += bit
+        if stuffed.endswith(("00000", "11111")):
+            stuffed += "10"[int(bit)]
+    assert exact_bits(frame) == len(stuffed) + 13
 
 
 def test_a_frame_is_written_as_candump_does() -> None:
