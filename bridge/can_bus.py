@@ -21,7 +21,6 @@ from bridge.clock import Clock, MonotonicClock
 from protocol.can_frame import CanFrame
 from protocol.errors import CanBusLostError, LinkClosedError, LinkError, LinkUriError
 
-DEFAULT_URI: Final = "udp_multicast:239.74.163.2"
 DEFAULT_PORT: Final = 43113
 REOPEN_PERIOD_NS: Final = 500_000_000
 LOST_AFTER_NS: Final = 10_000_000_000
@@ -30,7 +29,7 @@ LOST_AFTER_NS: Final = 10_000_000_000
 _BUS_OFF = 0x40  # CAN_ERR_BUSOFF in the identifier of an error frame (linux/can/error.h)
 _ECHOES = 256
 _EXAMPLES: Final = {
-    "udp_multicast": DEFAULT_URI,
+    "udp_multicast": "udp_multicast:239.74.163.2",
     "virtual": "virtual:motors",
     "socketcan": "socketcan:can0",
     "slcan": "slcan:/dev/ttyACM0",

@@ -29,6 +29,7 @@ from bridge.command_line import (
 )
 from bridge.summary import is_stdout, show_json
 from fwav_hil import __version__
+from plant_emulator.motor_options import chosen_motor_scenario, run_motor_options
 
 COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
@@ -37,6 +38,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "emulator": ("plant_emulator.command:emulator", "Run the plant emulator alone."),
         "controller": ("controller.command:controller", "Run the controller alone."),
         "latency": ("fwav_hil.latency.command:latency", "Measure where the time goes in the loop or on a link."),
+        "motor": ("plant_emulator.motor_command:motor", "Be six simulated drives on a CAN bus."),
         "paper": ("fwav_hil.studies.paper_command:paper_command", "Run the source paper's section IV again."),
         "margin": ("fwav_hil.studies.margin_command:margin_command", "Say whether the gains stand the link."),
         "design": ("fwav_hil.studies.design_command:design_command", "Search gains for a link."),
@@ -117,6 +119,7 @@ plots_option = click.option("--plots/--no-plots", default=True, show_default=Tru
     ),
     delay_option,
     legs_option,
+    run_motor_options,
     wait_option,
     out_option,
     log_error_option,
@@ -134,17 +137,29 @@ def run_command(
     link: str,
     delay_ns: int,
     legs: bool,
+    motor: str,
+    can: str,
+    protocol: str | None,
+    lag: float | None,
+    feedback: str,
+    can_log: Path | None,
+    tap: str | None,
     wait_s: float,
     out: Path | None,
     on_log_error: str,
     plots: bool,
     json_path: Path | None,
 ) -> None:
-    """Fly SCENARIO with the emulator and the controller as two processes that speak MAVLink over a link."""
-    chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
+    """Fly SCENARIO with the emulator and the controller as two processes that speak MAVLink over a link.
+
+    With --motor can the drives are a third one, on a CAN bus.
+    """
+    chosen = chosen_motor_scenario(
+        scenario, protocol=protocol, lag_s=lag, rate_hz=rate, duration_s=duration, seed=seed, law=law
+    )
     from controller.laws import make_law
     from fwav_hil.compile import compile_kernels
-    from fwav_hil.run import RunOptions, check_link, new_folder, run
+    from fwav_hil.run import MotorsOnCan, RunOptions, check_link, new_folder, run
     from protocol.errors import FwavHilError, UsageError
 
     chosen_law = make_law(chosen.law, chosen)
@@ -155,11 +170,23 @@ def run_command(
         raise UsageError(
             "--delay and --legs are of real time: add --clock realtime (in lockstep the scenario's [delay] is)"
         )
+    motors = MotorsOnCan(can=can, feedback=feedback, log=can_log, tap=tap) if motor == "can" else None
+    if motors:
+        from fwav_hil.run import check_motors
+
+        check_motors(chosen, motors)
     compile_kernels(chosen)
     folder = new_folder(chosen, out)
     try:
         run_options = RunOptions(
-            clock=clock, link=link, speed=speed, wait_s=wait_s, delay_ns=delay_ns, legs=legs, on_log_error=on_log_error
+            clock=clock,
+            link=link,
+            speed=speed,
+            wait_s=wait_s,
+            delay_ns=delay_ns,
+            legs=legs,
+            on_log_error=on_log_error,
+            motors=motors,
         )
         run(chosen, folder, run_options)
     except FwavHilError:
