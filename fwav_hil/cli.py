@@ -281,6 +281,10 @@ def _finish(folder: Path, json_path: Path | None, *, plots: bool) -> None:
         scenario = load_scenario(folder / FILES["scenario"])
         title = f"{summary['scenario']}, {summary['law']}, {summary['rate_hz']:g} Hz"
         drawn = plot_run(folder, scenario, load_truth(folder / FILES["ground_truth"]), title)
+        if (folder / FILES["can_log"]).exists():
+            from fwav_hil.bus_plot import plot_bus
+
+            drawn["hysteresis_bus"] = plot_bus(folder / FILES["can_log"], scenario, title)
         summary["files"] |= {name: str(file) for name, file in drawn.items()}
         write_json(path, summary)
     print_summary(summary, to_stderr=is_stdout(json_path))

@@ -18,6 +18,7 @@ from bridge.can_load import plan_bus
 from bridge.clock import MonotonicClock
 from bridge.memory import memory_pair
 from bridge.process import StopFlag
+from fwav_hil.bus_plot import plot_bus, read_encoders
 from fwav_hil.score import scores
 from fwav_hil.simulate import simulate
 from plant_emulator.can_motors import CanMotors
@@ -99,6 +100,18 @@ def test_the_default_record_is_a_blf_with_every_answer(tmp_path: Path, uri: str)
     ]
     assert len([frame for frame in frames if decode_answer(frame)]) == 6 * 100
     assert len([frame for frame in frames if decode_sync(frame)]) == 100
+
+
+def test_the_gears_can_be_drawn_from_the_bus_alone(tmp_path: Path, uri: str) -> None:
+    """Along the backlash u - tau is never more than half its width, and in a stroke it reaches that on both sides."""
+    scenario = short()
+    fly(scenario, tmp_path, MotorLink(can=uri))
+    points = read_encoders(tmp_path / "motor_bus.blf")
+    assert [len(of_axis) for of_axis in points] == [39] * 6
+    width = 0.002 / 0.04  # (h - kappa)/chi over full scale, at 1 rad of travel
+    apart = points[0][:, 1] - points[0][:, 0]
+    assert np.abs(apart).max() == pytest.approx(width, rel=0.05)
+    assert plot_bus(tmp_path / "motor_bus.blf", scenario, "flapper").stat().st_size > 10_000
 
 
 def test_the_load_on_the_bus_is_below_what_was_reckoned(tmp_path: Path, uri: str) -> None:
