@@ -1,5 +1,7 @@
 """`make bench`: run the benchmarks, print them beside their anchors, write results.json and RESULTS.md here.
 
+`python -m benchmarks can` measures the CAN protocols alone, and leaves the other rows as they were.
+
 Machines are shared and noisy, so each figure is the best of three alternations with its anchor.
 """
 
@@ -15,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from benchmarks.can_protocols import can_protocols
 from benchmarks.codec import codec
 from benchmarks.loop import lockstep_tick, simulated_steps
 from benchmarks.processor import processor_time
@@ -35,6 +38,7 @@ BENCHMARKS: dict[str, Callable[[argparse.Namespace], dict[str, dict[str, Any]]]]
     "processor": lambda _given: processor_time(),
     "start": lambda _given: start(),
     "read_log": lambda _given: read_log(),
+    "can": lambda _given: can_protocols(),
 }
 """By the name one calls it with: what it gives, by the names of its rows."""
 

@@ -18,10 +18,14 @@ _GRACE_S = 5.0
 
 
 class Child:
-    """A process of the project that reports one JSON object a line on its standard output."""
+    """A process of the project that reports one JSON object a line on its standard output.
 
-    def __init__(self, module: str, arguments: list[str]) -> None:
+    name   what it is called in messages, and calls itself on standard error; by default the module
+    """
+
+    def __init__(self, module: str, arguments: list[str], name: str | None = None) -> None:
         self.module = module
+        self.name = name or module
         self.process = subprocess.Popen(
             [sys.executable, "-m", module, *arguments, "--status", "jsonl", "--with-parent"],
             stdin=subprocess.PIPE,
@@ -40,9 +44,9 @@ class Child:
             return None
         lines = [line for line in self.error.splitlines() if line.strip()]
         if lines and code > 0:  # a process that was killed had no last word
-            return lines[-1].removeprefix(f"{self.module}: ")
+            return lines[-1].removeprefix(f"{self.name}: ")
         how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
-        return f"the {self.module.replace('_', ' ')} process {how}"
+        return f"the {self.name.replace('_', ' ')} process {how}"
 
     def tell(self, line: str) -> None:
         """Send it a line."""
@@ -91,13 +95,18 @@ class Child:
 def listen(children: list[Child]) -> Iterator[tuple[Child | None, dict[str, Any]]]:
     """The reports of all children as they come, until every one has closed its output.
 
-    Ten times a second at least something is yielded: (None, {}) where nothing came, so that a caller can look around.
+    Ten times a second at least something is yielded: (None, {}) where nothing came, so that a caller can look around. The
+    list may grow meanwhile: further children are heard from then on.
     """
     with selectors.DefaultSelector() as selector:
-        for child in children:
-            selector.register(child.process.stdout, selectors.EVENT_READ, (child, True))  # type: ignore[arg-type]
-            selector.register(child.process.stderr, selectors.EVENT_READ, (child, False))  # type: ignore[arg-type]
-        while selector.get_map():
+        heard = 0
+        while True:
+            for child in children[heard:]:
+                selector.register(child.process.stdout, selectors.EVENT_READ, (child, True))  # type: ignore[arg-type]
+                selector.register(child.process.stderr, selectors.EVENT_READ, (child, False))  # type: ignore[arg-type]
+            heard = len(children)
+            if not selector.get_map():
+                return
             ready = selector.select(0.1)
             if not ready:
                 yield None, {}

@@ -32,6 +32,7 @@ from bridge.command_line import (
 )
 from bridge.summary import is_stdout, show_json
 from fwav_hil import __version__
+from plant_emulator.motor_options import chosen_motor_scenario, run_motor_options
 
 COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
@@ -40,6 +41,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "emulator": ("plant_emulator.command:emulator", "Run the plant emulator alone."),
         "controller": ("controller.command:controller", "Run the controller alone."),
         "latency": ("fwav_hil.latency.command:latency", "Measure where the time goes in the loop or on a link."),
+        "motor": ("plant_emulator.motor_command:motor", "Be six simulated drives on a CAN bus."),
         "paper": ("fwav_hil.studies.paper_command:paper_command", "Run the source paper's section IV again."),
         "margin": ("fwav_hil.studies.margin_command:margin_command", "Say whether the gains stand the link."),
         "design": ("fwav_hil.studies.design_command:design_command", "Search gains for a link."),
@@ -125,6 +127,7 @@ plots_option = click.option("--plots/--no-plots", default=True, show_default=Tru
     ),
     delay_option,
     legs_option,
+    run_motor_options,
     wait_option,
     out_option,
     log_error_option,
@@ -145,19 +148,31 @@ def run_command(
     link: str,
     delay_ns: int,
     legs: bool,
+    motor: str,
+    can: str,
+    protocol: str | None,
+    lag: float | None,
+    feedback: str,
+    can_log: Path | None,
+    tap: str | None,
     wait_s: float,
     out: Path | None,
     on_log_error: str,
     plots: bool,
     json_path: Path | None,
 ) -> None:
-    """Fly SCENARIO with the emulator and the controller as two processes that speak MAVLink over a link."""
-    chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
+    """Fly SCENARIO with the emulator and the controller as two processes that speak MAVLink over a link.
+
+    With --motor can the drives are a third one, on a CAN bus.
+    """
+    chosen = chosen_motor_scenario(
+        scenario, protocol=protocol, lag_s=lag, rate_hz=rate, duration_s=duration, seed=seed, law=law
+    )
     from bridge.link import refuse_rate_that_cannot_fit
     from bridge.realtime import check_real_time
     from controller.laws import make_law
     from fwav_hil.compile import compile_kernels
-    from fwav_hil.run import RunOptions, check_link, new_folder, run
+    from fwav_hil.run import MotorsOnCan, RunOptions, check_link, new_folder, run
     from protocol.errors import FwavHilError, UsageError
 
     chosen_law = make_law(chosen.law, chosen)
@@ -171,12 +186,17 @@ def run_command(
         raise UsageError(
             "--delay and --legs are of real time: add --clock realtime (in lockstep the scenario's [delay] is)"
         )
+    motors = MotorsOnCan(can=can, feedback=feedback, log=can_log, tap=tap) if motor == "can" else None
+    if motors:
+        from fwav_hil.run import check_motors
+
+        check_motors(chosen, motors)
     compile_kernels(chosen)
     folder = new_folder(chosen, out)
     try:
         run_options = RunOptions(
             clock=clock, link=link, speed=speed, wait_s=wait_s, delay_ns=delay_ns, legs=legs, on_log_error=on_log_error,
-            realtime=realtime, trigger=trigger, spin_us=spin_us,
+            motors=motors, realtime=realtime, trigger=trigger, spin_us=spin_us,
         )  # fmt: skip
         run(chosen, folder, run_options)
     except FwavHilError:
@@ -271,6 +291,10 @@ def _finish(folder: Path, json_path: Path | None, *, plots: bool) -> None:
         scenario = load_scenario(folder / FILES["scenario"])
         title = f"{summary['scenario']}, {summary['law']}, {summary['rate_hz']:g} Hz"
         drawn = plot_run(folder, scenario, load_truth(folder / FILES["ground_truth"]), title)
+        if (folder / FILES["can_log"]).exists():
+            from fwav_hil.bus_plot import plot_bus
+
+            drawn["hysteresis_bus"] = plot_bus(folder / FILES["can_log"], scenario, title)
         summary["files"] |= {name: str(file) for name, file in drawn.items()}
         write_json(path, summary)
     print_summary(summary, to_stderr=is_stdout(json_path))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -63,11 +63,17 @@ def plot_run(folder: Path, scenario: Scenario, truth: npt.NDArray[np.void], titl
             _show_limits(panel, factor, scenario, axis, truth["command"][:, axis])
             panel.set_title(f"{name} ({unit})")
 
-    with _grid(plots["hysteresis"], f"{title}: gears, u against tau", "motor command tau") as axes:
-        for axis, (panel, (name, factor, unit)) in enumerate(zip(axes, _FORCES, strict=True)):
-            panel.plot(factor * truth["tau"][:, axis], factor * truth["u"][:, axis], color=EXTRA, linewidth=0.5)
-            panel.set_title(f"{name}: u over tau ({unit})")
+    curves = [np.stack((truth["tau"][:, axis], truth["u"][:, axis]), axis=1) for axis in range(6)]
+    gear_panels(plots["hysteresis"], f"{title}: gears, u against tau", curves)
     return plots
+
+
+def gear_panels(path: Path, title: str, curves: Sequence[FloatArray]) -> None:
+    """u against tau of six axes; curves: (n, 2) each, tau and u."""
+    with _grid(path, title, "motor command tau") as axes:
+        for curve, panel, (name, factor, unit) in zip(curves, axes, _FORCES, strict=True):
+            panel.plot(factor * curve[:, 0], factor * curve[:, 1], color=EXTRA, linewidth=0.5)
+            panel.set_title(f"{name}: u over tau ({unit})")
 
 
 def _show_limits(panel: Any, factor: float, scenario: Scenario, axis: int, values: FloatArray) -> None:

@@ -26,6 +26,8 @@ FILES = {
     "scenario": "scenario.toml",
     "emulator": "emulator.json",
     "controller": "controller.json",
+    "motor": "motor.json",
+    "can_log": "motor_bus.blf",
     "summary": "summary.json",
 }
 _DROPPED = (
@@ -45,6 +47,9 @@ _REFUSED = (
     "old_commands",
     "unknown_flags",
     "unknown_echoes",
+    "unknown_frames",
+    "short_frames",
+    "malformed_frames",
 )
 
 
@@ -61,6 +66,8 @@ def summarise(folder: Path, *, placement: str = "", budget: dict[str, Any] | Non
         return before  # no process wrote counters here: what `simulate` knew of the run stands in its summary alone
     wall_s = emulator.get("wall_s")
     ends = {"emulator": emulator.get("counters", {}), "controller": controller.get("counters", {})}
+    if motor := read_json(folder / FILES["motor"]):
+        ends["motor"] = motor.get("counters", {})
     summary = {
         **head(scenario, truth),
         "clock": emulator.get("clock"),
@@ -87,6 +94,8 @@ def summarise(folder: Path, *, placement: str = "", budget: dict[str, Any] | Non
         "error": emulator.get("error") or controller.get("error"),
         "files": {name: str(folder / file) for name, file in FILES.items() if (folder / file).exists()},
     }
+    if "can" in emulator:
+        summary["can"] = emulator["can"]
     summary["files"]["summary"] = str(folder / FILES["summary"])
     write_json(folder / FILES["summary"], summary)
     return summary

@@ -17,6 +17,7 @@ from bridge.link import parse_link_uri
 from bridge.process import StopFlag
 from bridge.summary import make_folder, refuse_existing_run, write_text
 from fwav_hil.children import Child, listen
+from fwav_hil.motor_child import MotorKeeper
 from fwav_hil.progress import Progress
 from fwav_hil.report import FILES, summarise
 from fwav_hil.studies.margin import budget_line
@@ -24,6 +25,22 @@ from protocol.errors import FwavHilError, Interrupted, PeerError, UsageError
 from protocol.scenario import NANOSECONDS, Scenario
 
 _IN_TO_OUT = {"udpin": "udpout", "tcpin": "tcpout"}
+
+
+class MotorsOnCan(msgspec.Struct, frozen=True, kw_only=True):
+    """The drives of a run on a CAN bus; see `plant_emulator.process.MotorLink`."""
+
+    can: str
+    feedback: str = "sync"
+    log: Path | None = None
+    tap: str | None = None
+
+    @property
+    def emulator_arguments(self) -> list[str]:
+        """What the emulator is told."""
+        arguments = ["--motor", "can", "--can", self.can, "--feedback", self.feedback]
+        arguments += ["--can-log", str(self.log)] if self.log else []
+        return arguments + (["--tap", self.tap] if self.tap else [])
 
 
 class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -35,6 +52,7 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     clock: str = "lockstep"
     link: str = "udpin://127.0.0.1:14560"
+    motors: MotorsOnCan | None = None
     speed: float | None = None
     wait_s: float = 30.0
     realtime: bool = False
@@ -120,6 +138,15 @@ def check_link(uri: str) -> None:
     parse_link_uri(uri)
 
 
+def check_motors(scenario: Scenario, motors: MotorsOnCan) -> None:
+    """Raise UsageError or LinkUriError where the drives' bus cannot be what is asked for, before anything is started."""
+    from bridge.can_bus import parse_can_uri
+    from bridge.can_load import plan_bus
+
+    parse_can_uri(motors.can)
+    plan_bus(scenario.motor.protocol, scenario.motor, scenario.rate_hz)
+
+
 def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]:
     """Run both processes; returns the summary, which is also in the folder. Raises RunFailedError, Interrupted, ...
 
@@ -147,6 +174,8 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
     own = ["--speed", str(options.speed)] if options.speed else []
     if options.delay_ns:
         own += ["--delay", f"{options.delay_ns}ns"]
+    if options.motors:
+        own += options.motors.emulator_arguments
     if options.legs:
         common.append("--legs")
     flight = ["--link", f"{scheme}://{address}", *own, "--on-log-error", options.on_log_error]
@@ -155,16 +184,21 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
     controller = Child(
         "controller", [*common, *placement.controller, "--link", "-", "--arm", "--trigger", options.trigger]
     )
+    keeper = None
+    if options.motors and not options.motors.can.startswith("virtual:"):
+        keeper = MotorKeeper([common[0], "--can", options.motors.can, "--out", str(folder)])
     try:
-        _watch(scenario, emulator, controller, stop, Progress(scenario.duration_s) if options.show_progress else None)
+        progress = Progress(scenario.duration_s) if options.show_progress else None
+        _watch(scenario, emulator, controller, keeper, stop, progress)
     finally:
-        for child in (emulator, controller):
+        for child in (emulator, controller, *((keeper,) if keeper else ())):
             child.end()
     known = msgspec.to_builtins(budget)
     summary = summarise(folder, placement=placement.text, budget=known) if _has_rows(folder) else {}
     if stop.requested:
         raise Interrupted(f"interrupted: what was recorded until then is in {folder}")
-    for child in _culprit_first(emulator, controller):
+    culprits = _culprit_first(emulator, controller)
+    for child in (keeper.child, *culprits) if keeper and keeper.failed else culprits:
         if child.failure:
             raise RunFailedError(
                 child.failure, child.process.returncode if child.process.returncode > 0 else PeerError.exit_code
@@ -172,13 +206,23 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
     return summary
 
 
-def _watch(scenario: Scenario, emulator: Child, controller: Child, stop: StopFlag, progress: Progress | None) -> None:
-    """Hear both processes until both have ended, and show how the run goes."""
+def _watch(
+    scenario: Scenario,
+    emulator: Child,
+    controller: Child,
+    keeper: MotorKeeper | None,
+    stop: StopFlag,
+    progress: Progress | None,
+) -> None:
+    """Hear all processes until they have ended, and show how the run goes."""
     told = False
     patience = _PATIENCE
+    children = [emulator, controller, *((keeper.child,) if keeper else ())]
     with progress or nullcontext():
-        for child, event in listen([emulator, controller]):
+        for child, event in listen(children):
             kind = event.get("event")
+            if keeper and not stop.requested:
+                keeper.look(children, emulator)
             if child is emulator and kind == "waiting":
                 told = True
                 scheme, _, address = event["link"].partition("://")
@@ -187,12 +231,18 @@ def _watch(scenario: Scenario, emulator: Child, controller: Child, stop: StopFla
                 sys.stderr.write(event["text"] + "\n")
             elif progress and child is emulator and kind == "progress":
                 progress.update(event["t_ns"] / NANOSECONDS, _error_now(scenario, event["t_ns"], event["q"]))
-            if stop.requested or any(one.process.poll() for one in (emulator, controller)):
+            elif kind in ("motors_lost", "motors_back"):
+                said = "fell silent: safe output" if kind == "motors_lost" else "are back"
+                click.echo(f"t = {event['t_ns'] / NANOSECONDS:.3f} s: the drives {said}", err=True)
+            failed = any(one.process.poll() for one in (emulator, controller)) or bool(keeper and keeper.failed)
+            if stop.requested or failed:
                 # What still runs ends by itself in a moment, or is asked to; signals of a terminal went to all already.
                 patience -= 1
                 if patience == 0 or not told:
                     emulator.ask_to_end()
                     controller.ask_to_end()
+                    if keeper:
+                        keeper.child.ask_to_end()
                 elif patience < -_PATIENCE:
                     return
 

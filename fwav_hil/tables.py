@@ -34,6 +34,14 @@ def print_summary(summary: dict[str, Any], *, to_stderr: bool = False) -> None:
             )
             console.print(f"{what} {shown}{note}")
     _print_real_time(console, summary)
+    if can := summary.get("can"):
+        counted = summary["counters"]["emulator"]
+        bitrate = str(can["bitrate"])
+        console.print(
+            f"{can['protocol']} drives on {can['uri']}: {can['measured_load_percent'][bitrate]:.0f} % of "
+            f"{can['bitrate'] / 1000:g} kbit/s ({can['load_percent'][bitrate]:.0f} % reckoned at worst), "
+            f"outages {counted['motor_outages']}, recoveries {counted['motor_recoveries']}"
+        )
     if counters := summary.get("counters"):
         console.print(", ".join(f"{name} {counters[name]}" for name in ("missed", "late", "dropped", "refused")))
 

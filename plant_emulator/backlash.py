@@ -12,6 +12,8 @@ from protocol.scenario import Backlash, Play
 
 BACKLASH = 0
 PLAY = 1
+ELSEWHERE = 2
+"""No gear here: what comes in is the force behind one (drives on a CAN bus have their own)."""
 
 
 @compiled
@@ -43,6 +45,8 @@ def gear_step(
     if model == BACKLASH:
         d = backlash_step(tau, tau_next, d, h, p, chi)
         return h * tau_next + d, d
+    if model == ELSEWHERE:
+        return tau_next, 0.0
     u = play_step(u, tau_next, h, p)
     return u, u - h * tau_next
 

@@ -9,7 +9,6 @@ import click
 from bridge.command_line import (
     DEFAULT_PORT,
     begin_process,
-    chosen_scenario,
     clock_option,
     delay_option,
     duration_option,
@@ -28,6 +27,7 @@ from bridge.command_line import (
 from bridge.link import refuse_rate_that_cannot_fit
 from bridge.realtime import check_real_time, own_core
 from bridge.summary import show_json
+from plant_emulator.motor_options import chosen_motor_scenario, run_motor_options
 
 EXAMPLE = """
 \b
@@ -56,6 +56,7 @@ Example:
     delay_option,
     legs_option,
     wait_option,
+    run_motor_options,
     click.option(
         "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
         help="Folder for the log, the ground truth and the counters.",
@@ -77,6 +78,13 @@ def emulator(
     delay_ns: int,
     legs: bool,
     wait_s: float,
+    motor: str,
+    can: str,
+    protocol: str | None,
+    lag: float | None,
+    feedback: str,
+    can_log: Path | None,
+    tap: str | None,
     out: Path | None,
     on_log_error: str,
     json_path: Path | None,
@@ -85,17 +93,19 @@ def emulator(
     with_parent: bool,
 ) -> None:
     """Run the plant emulator alone: it waits for a controller, then flies SCENARIO (a file or a name) with it."""
-    chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed)
+    chosen = chosen_motor_scenario(scenario, protocol=protocol, lag_s=lag, rate_hz=rate, duration_s=duration, seed=seed)
     check_real_time(clock, realtime=realtime)
     if clock == "realtime" or speed:
         refuse_rate_that_cannot_fit(link, chosen.rate_hz * (1.0 if clock == "realtime" else speed or 1.0))
     report, stop = begin_process(status, core, with_parent=with_parent)
-    from plant_emulator.process import EmulatorOptions, run_emulator
+    from plant_emulator.process import EmulatorOptions, MotorLink, run_emulator
 
+    motors = MotorLink(can=can, feedback=feedback, log=can_log, tap=tap) if motor == "can" else None
     run_options = EmulatorOptions(
         link=link, clock=clock, speed=speed, out=out, wait_s=wait_s, spin_s=None if spin_us is None else spin_us * 1e-6,
         realtime=realtime, core=own_core(0) if core is None else core, delay_ns=delay_ns, legs=legs,
         on_log_error=on_log_error,
+        motors=motors,
     )  # fmt: skip
     summary = run_emulator(chosen, run_options, report, stop)
     show_json(json_path, {"scenario": chosen.name, "rate_hz": chosen.rate_hz, "seed": chosen.seed, **summary})

@@ -5,6 +5,8 @@ It knows nothing of how time is kept; that is `pacing`. To the outside it speaks
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from bridge.endpoint import Endpoint
@@ -15,19 +17,26 @@ from plant_emulator.sensors import InertialSensors
 from plant_emulator.truth import TruthWriter
 from protocol import mavlink_map
 from protocol.errors import DivergenceError
-from protocol.messages import ActuatorCommand
+from protocol.messages import ActuatorCommand, FloatArray
 from protocol.scenario import Scenario
 from protocol.streams import Due, stream
+
+if TYPE_CHECKING:  # what a run without a CAN bus need not load
+    from plant_emulator.can_motors import CanMotors
 
 
 class Emulator:
     """Plant, sensors and safety envelope of one run.
 
+    motors     drives behind a CAN bus, which then have the gears; None: motors and gears are the plant's
     counters   of the safety envelope, and refused_commands: commands with a control that is not a number
     """
 
-    def __init__(self, scenario: Scenario, endpoint: Endpoint, truth: TruthWriter | None) -> None:
-        self.plant = Plant(scenario)
+    def __init__(
+        self, scenario: Scenario, endpoint: Endpoint, truth: TruthWriter | None, motors: CanMotors | None = None
+    ) -> None:
+        self.plant = Plant(scenario, gears_elsewhere=motors is not None)
+        self.motors = motors
         self.safety = SafetyEnvelope(scenario.actuators)
         self._scale = np.array(scenario.actuators.scale)
         self._endpoint = endpoint
@@ -67,7 +76,7 @@ class Emulator:
         nothing done, where the datagram is anything else or other frames are due too. Raises DivergenceError, the tick's row
         being recorded.
         """
-        if end_ns >= self._quiet_until_ns:
+        if end_ns >= self._quiet_until_ns or self.motors:
             return None
         try:
             return self._quick.go_on(datagram, self._row, t_ns, end_ns, delay_ns)
@@ -87,14 +96,22 @@ class Emulator:
     def act(self, arrival_ns: int, delay_ns: int, command: ActuatorCommand) -> None:
         """Let a command that arrived at simulation time arrival_ns act delay_ns later, within the safety envelope."""
         self._quick.newest[:] = command.tau
-        self.plant.command(arrival_ns + delay_ns, self.safety.accept(arrival_ns, command))
+        self._drive(arrival_ns, arrival_ns + delay_ns, self.safety.accept(arrival_ns, command))
+
+    def _drive(self, t_ns: int, acts_ns: int, tau: FloatArray) -> None:
+        """Let tau (6,), asked for at t_ns, act from acts_ns on."""
+        if self.motors:
+            acts_ns += self.motors.delay_ns
+            tau = self.motors.drive(t_ns, tau, acts_ns)  # the force behind the gears: the plant takes it as it is
+        self.plant.command(acts_ns, tau)
 
     def check_staleness(self, t_ns: int) -> None:
         """Turn to the safe output where no command has come for too long."""
         stale = self.safety.stale_output(t_ns)
         if stale is not None:
             expired_ns, output = stale
-            self.plant.command(max(expired_ns, self.plant.t_ns), output)
+            acts_ns = max(expired_ns, self.plant.t_ns)
+            self._drive(acts_ns, acts_ns, output)
 
     def advance(self, end_ns: int) -> None:
         """Record the tick and integrate to the next one. Raises DivergenceError, the tick's row being recorded."""
@@ -102,6 +119,8 @@ class Emulator:
         try:
             self.plant.record_and_advance(end_ns, self._quick.newest, self._row)
         finally:
+            if self.motors:
+                self._row[19:25] = self.motors.tau_at(t_ns)
             self._record(t_ns)
 
     def flush(self) -> None:
@@ -111,4 +130,5 @@ class Emulator:
 
     def all_counters(self) -> dict[str, int]:
         """Everything counted, by name."""
-        return {**self._endpoint.counters(), **self.safety.counters, **self.counters}
+        of_motors = self.motors.counters if self.motors else {}
+        return {**self._endpoint.counters(), **self.safety.counters, **self.counters, **of_motors}

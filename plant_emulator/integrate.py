@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from plant_emulator.backlash import gear_parameters, gear_step
+from plant_emulator.backlash import ELSEWHERE, gear_parameters, gear_step
 from plant_emulator.rigid_body import BodyParameters, Specific, acceleration, body_parameters
 from protocol.compiled import Packed, compiled, pack, views
 from protocol.errors import DivergenceError
@@ -230,12 +230,17 @@ class Plant:
     """The plant for callers in Python: `command` what the motors shall do and when, `advance` the time.
 
     State: see `PlantState`. Time starts at 0 ns. Nothing here reads a clock or draws a random number.
+
+    gears_elsewhere   commands are forces behind the gears, which stand outside this plant
     """
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, *, gears_elsewhere: bool = False) -> None:
         self.state = initial_state(scenario)
         self.body = body_parameters(scenario.body, scenario.disturbance)
         self.gears = GearParameters(*gear_parameters(scenario.hysteresis))
+        if gears_elsewhere:
+            self.gears = self.gears._replace(model=ELSEWHERE)
+            self.state.tau[:] = self.state.u
         self.substep_ns = scenario.substep_ns
         self.parameters = pack({**self.body._asdict(), **self.gears._asdict(), "substep_ns": self.substep_ns})
         self.t_ns = 0

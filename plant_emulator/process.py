@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -30,10 +31,26 @@ from protocol.scenario import NANOSECONDS, Scenario
 from protocol.streams import Due
 from protocol.tlog import TlogWriter
 
+if TYPE_CHECKING:
+    from plant_emulator.can_motors import CanMotors
+
 HELLO_PERIOD_S = 0.1
 PROGRESS_PERIOD_NS = 100_000_000
 FAREWELLS = 3
 """Times the end is said, since a datagram may be lost."""
+
+
+class MotorLink(msgspec.Struct, frozen=True, kw_only=True):
+    """How the emulator reaches its drives.
+
+    can: URI of the bus. feedback: "sync" (every bit of u) or "bus" (the protocol's own status). log: where the bus is
+    recorded, by suffix; None: motor_bus.blf in the run folder, if there is one. tap: MAVLink link of the CAN tap.
+    """
+
+    can: str
+    feedback: str = "sync"
+    log: Path | None = None
+    tap: str | None = None
 
 
 class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -44,6 +61,7 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     lists, with `core` as the core to have. spin_s: in lockstep see `Link.spin_s` (None: 0); in real time how long to poll
     before each deadline (None: as measured with `realtime`, else 0).
     on_log_error: what a disk that refuses means for the run: "stop", or "continue" with what can be recorded.
+    motors: where the drives are, if not in the plant itself.
     """
 
     link: str
@@ -57,6 +75,7 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     on_log_error: str = "stop"
     realtime: bool = False
     core: int | None = None
+    motors: MotorLink | None = None
 
 
 def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
@@ -89,8 +108,11 @@ def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report
             refuse_existing_run(options.out)
             log, truth = _open_files(scenario, link, options, options.out, report)
         endpoint = Endpoint(link, VEHICLE[0], scenario.wire.emulator_component)
-        emulator = Emulator(scenario, endpoint, truth)
-        with maybe_real_time(options.core, wanted=options.realtime) as settings:
+        with (
+            _motors(scenario, options, report, stop) as motors,
+            maybe_real_time(options.core, wanted=options.realtime) as settings,
+        ):
+            emulator = Emulator(scenario, endpoint, truth, motors)
             report_settings(report, settings)
             pacing = _pacing(scenario, options, emulator, endpoint, log, MonotonicClock(), stop, settings)
             report({"event": "waiting", "link": link.uri})
@@ -151,6 +173,19 @@ def warm_up(scenario: Scenario) -> None:
         emulator.act(0, 0, command)
         emulator.advance(scenario.period_ns)
         emulator.go_on(b"", 0, 1, 0)
+
+
+def _motors(
+    scenario: Scenario, options: EmulatorOptions, report: Report, stop: StopFlag
+) -> contextlib.AbstractContextManager[CanMotors | None]:
+    """The drives behind a bus, where there is one: python-can is loaded only then."""
+    if options.motors is None:
+        return contextlib.nullcontext()
+    from plant_emulator.motor_setup import open_motors
+
+    return open_motors(
+        scenario, options.motors, options.out, clock=options.clock, wait_s=options.wait_s, report=report, stop=stop
+    )
 
 
 def _pacing(
@@ -258,6 +293,8 @@ def _run_ticks(
     if isinstance(pacing.log, RingRecorder):
         pacing.log.sidecar["counters"] = counters
         pacing.log.sidecar["links"][0]["peer"] = pacing.endpoint.link.peer
+    if emulator.motors:
+        summary["can"] = emulator.motors.summary(done * period_ns / NANOSECONDS)
     if out:
         write_json(out / "emulator.json", summary)
         if isinstance(pacing, RealTime) and pacing.legs:

@@ -7,6 +7,7 @@
      |   |- LinkUriError        2   the URI is not one
      |   |- LinkInUseError      3   the port or device is taken
      |   |- LinkClosedError     3   the other end closed the link
+     |   |- CanBusLostError     3   the CAN interface went bus-off or away, and did not come back
      |- PeerError               4   the other process
      |   |- PeerMissingError    4   never came
      |   |- PeerLostError       4   was there and fell silent
@@ -57,6 +58,10 @@ class LinkInUseError(LinkError):
 
 class LinkClosedError(LinkError):
     """The other end closed the link (stream transports)."""
+
+
+class CanBusLostError(LinkError):
+    """The CAN interface went bus-off or away, and did not come back."""
 
 
 class PeerError(FwavHilError):

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from pymavlink.dialects.v20 import common
 
+from protocol.can_frame import EXTENDED_IDS, LONGEST_DATA, STANDARD_IDS, CanFrame
 from protocol.compiled import Packed, compiled
 from protocol.frames import euler_from_quaternion, quaternion_from_euler
 from protocol.mavlink_codec import layout
@@ -30,6 +31,7 @@ ATTITUDE_TARGET = layout("ATTITUDE_TARGET")
 COMMAND_LONG = layout("COMMAND_LONG")
 COMMAND_ACK = layout("COMMAND_ACK")
 TIMESYNC = layout("TIMESYNC")
+CAN_FRAME = layout("CAN_FRAME")
 
 UNIT_TOLERANCE = 1e-3
 """How far the length of a quaternion may be from one."""
@@ -367,3 +369,37 @@ def decode_timesync(payload: bytes) -> tuple[int, int]:
 
 
 ARM_DISARM = common.MAV_CMD_COMPONENT_ARM_DISARM
+
+_CAN_EXTENDED = 1 << 31
+_CAN_REMOTE = 1 << 30
+
+
+def encode_can_frame(frame: CanFrame) -> bytes:
+    """CAN_FRAME payload, bus 0, for whoever listens; bit 31 of the identifier marks 29 bits, bit 30 a remote frame."""
+    flags = (_CAN_EXTENDED if frame.extended else 0) | (_CAN_REMOTE if frame.remote else 0)
+    return CAN_FRAME.pack_fields(id=frame.can_id | flags, len=len(frame.data), data=frame.data)
+
+
+def decode_can_frame(payload: bytes) -> CanFrame | None:
+    """The frame in a CAN_FRAME for us on bus 0; None where it is for somebody else or no classical frame."""
+    values = CAN_FRAME.unpack_fields(payload)
+    extended, remote = bool(values["id"] & _CAN_EXTENDED), bool(values["id"] & _CAN_REMOTE)
+    can_id = values["id"] & (EXTENDED_IDS - 1)
+    if values["bus"] != 0 or values["len"] > LONGEST_DATA or (not extended and can_id >= STANDARD_IDS):
+        return None
+    return CanFrame(can_id, b"" if remote else bytes(values["data"][: values["len"]]), extended, remote)
+
+
+def decode_can_forward(payload: bytes) -> int | None:
+    """The bus (from 1 on; 0 ends it) that a COMMAND_LONG asks to have forwarded; None where it asks for something else."""
+    values = COMMAND_LONG.unpack_fields(payload)
+    bus = values["param1"]
+    if values["command"] != common.MAV_CMD_CAN_FORWARD or not math.isfinite(bus):
+        return None
+    return int(bus)
+
+
+def encode_can_forward_acknowledgement(*, accepted: bool) -> bytes:
+    """COMMAND_ACK payload for MAV_CMD_CAN_FORWARD."""
+    result = common.MAV_RESULT_ACCEPTED if accepted else common.MAV_RESULT_DENIED
+    return COMMAND_ACK.pack_fields(command=common.MAV_CMD_CAN_FORWARD, result=result)

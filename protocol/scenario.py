@@ -14,7 +14,7 @@ import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
 import numpy as np
@@ -178,6 +178,58 @@ class Wire(_Table, frozen=True):
     emulator_component: Annotated[int, Meta(ge=2, le=255)] = 191
 
 
+class Motor(_Table, frozen=True):
+    """The drives on a CAN bus, six alike; without one (`--motor direct`) nothing of this table is used.
+
+    bitrate             of the bus, bit/s; the one that load and delay are reckoned with
+    first_node_id       the drive of axis i has node id first_node_id + i
+    full_scale_nm       torque on the bus that stands for `actuators.scale` of an axis. A power of two keeps every bit.
+    lag_s               time constant of the drive's torque (current) loop        loop_hz  rate of that loop
+    rate_limit          fastest change of an axis, in full scales per second; 0: none
+    torque_limit        largest torque of an axis, as a fraction of full scale
+    watchdog_s          without a command for this long the drive turns to `actuators.safe` and latches an error
+    temperature_rise    steady rise at full torque (K), reached with thermal_time_constant_s; copper loss goes with torque^2
+    over_temperature_celsius    above it the drive turns to `actuators.safe` and latches an error
+    torque_constant     N m per A of motor current        bus_voltage  of the supply, V
+    travel_rad          shaft angle that stands for `actuators.scale`: motor side for tau, output side for u
+    encoder_counts      per turn, both sides              velocity_resolution  rad/s; 0: none
+    *_rate_hz           cyclic messages: encoder, heartbeat, and the rest of the status
+    bus_delay           commands act later by the worst wait for the bus and their own time on it
+    mit_*               ranges of the MIT frames (each +-) and the length of a reply: they differ by motor
+    """
+
+    protocol: str = "odrive"
+    bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 1_000_000
+    first_node_id: Annotated[int, Meta(ge=1, le=38)] = 21
+    full_scale_nm: Positive = 16.0
+    lag_s: NotNegative = 0.001
+    loop_hz: Positive = 8000.0
+    rate_limit: NotNegative6 = ZERO6
+    torque_limit: Positive6 = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    watchdog_s: Positive = 0.05
+    temperature_rise: NotNegative = 60.0
+    thermal_time_constant_s: Positive = 60.0
+    over_temperature_celsius: float = 100.0
+    torque_constant: Positive = 0.82
+    bus_voltage: Positive = 24.0
+    travel_rad: Positive = 1.0
+    encoder_counts: Annotated[int, Meta(ge=4, le=1 << 24)] = 16384
+    velocity_resolution: NotNegative = 0.0
+    encoder_rate_hz: Positive = 100.0
+    heartbeat_rate_hz: Positive = 10.0
+    status_rate_hz: Positive = 20.0
+    bus_delay: bool = False
+    mit_position_range: Positive = 12.5
+    mit_velocity_range: Positive = 50.0
+    mit_torque_range: Positive = 18.0
+    mit_reply_bytes: Literal[5, 6, 8] = 8
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.lag_s > 0.0 and self.lag_s * self.loop_hz < 1.0:
+            raise ValueError(f"lag_s must be 0, or at least one period of the torque loop ({1 / self.loop_hz:g} s)")
+
+
 class Scenario(_Table, frozen=True):
     """A whole run. Times in s, rates in Hz; a period is kept in whole nanoseconds (`period_ns`)."""
 
@@ -199,6 +251,7 @@ class Scenario(_Table, frozen=True):
     disturbance: Disturbance = Disturbance(amplitude=ZERO6, frequency_rad_s=0.0)
     world: World = World()
     wire: Wire = Wire()
+    motor: Motor = Motor()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -256,9 +309,22 @@ class Scenario(_Table, frozen=True):
         return np.array((*start.position, *start.attitude, *start.velocity, *start.attitude_rate))
 
     def digest(self) -> bytes:
-        """8 bytes that two ends must share: of all but what a command line may choose for one end alone."""
+        """8 bytes that emulator and controller must share: of all but what a command line may choose for one end alone.
+
+        The drives are none of the controller's business: their table leaves no trace.
+        """
+        return self._digest(without_motor=True)
+
+    def drive_digest(self) -> bytes:
+        """8 bytes that emulator and drives must share: those of `digest`, and the table of the drives."""
+        return self._digest(without_motor=False)
+
+    def _digest(self, *, without_motor: bool) -> bytes:
         common = msgspec.structs.replace(self, rate_hz=1000.0, substep_s=0.001, duration_s=1.0, seed=0, law="")
-        return hashlib.sha256(msgspec.json.encode(common, order="sorted")).digest()[:8]
+        document = msgspec.to_builtins(common)
+        if without_motor:
+            del document["motor"]
+        return hashlib.sha256(msgspec.json.encode(document, order="sorted")).digest()[:8]
 
     def to_toml(self) -> str:
         """The scenario in full, every default written out."""

@@ -50,6 +50,12 @@ STREAMS = (
     Stream(
         "TIMESYNC", End.BOTH, 1.0, "real time only: how far the other end's clock is ahead; 20 Hz for the first ten"
     ),
+    Stream(
+        "CAN_FRAME",
+        End.EMULATOR,
+        None,
+        "on the tap's own link (`--tap`): the motor bus, while 32000 is renewed within 5 s",
+    ),
     Stream("COMMAND_LONG", End.STATION, None, "to the controller: 400 (arm, disarm)"),
     Stream("COMMAND_ACK", End.CONTROLLER, None, "the answer to it"),
 )

@@ -13,7 +13,7 @@ from bridge.link import Link
 from bridge.process import StopFlag
 from controller.laws import make_law
 from controller.process import ControllerOptions, serve
-from plant_emulator.process import EmulatorOptions, fly
+from plant_emulator.process import EmulatorOptions, MotorLink, fly
 from protocol.errors import FwavHilError
 from protocol.scenario import Scenario, find_scenario, load_scenario, with_overrides
 
@@ -43,10 +43,11 @@ def fly_both(
     arm: bool = True,
     legs: bool = False,
     wait_s: float = 20.0,
+    motors: MotorLink | None = None,
 ) -> Ends:
     """Run both ends to their end."""
     theirs = controller_scenario or scenario
-    emulator = EmulatorOptions(link="-", clock=clock, out=out, wait_s=wait_s, legs=legs)
+    emulator = EmulatorOptions(link="-", clock=clock, out=out, wait_s=wait_s, legs=legs, motors=motors)
     service_options = ControllerOptions(link="-", clock=clock, out=out, wait_s=wait_s, arm=arm, legs=legs)
     law = make_law(theirs.law, theirs)
     plant_emulator.process.warm_up(scenario)
