@@ -42,7 +42,6 @@ def motor(
     json_path: Path | None,
     status: str,
     core: int | None,
-    spin_us: int,
     with_parent: bool,
 ) -> None:
     """Be six simulated drives on a CAN bus, with the limits and gears of SCENARIO, for whatever controller commands them.
