@@ -14,7 +14,7 @@ from protocol.messages import AXES, AXIS_UNITS, FloatArray
 
 _SHOWN = {
     "command": (("force x", 1e3, "mN"), ("force y", 1e3, "mN"), ("force z", 1e3, "mN"),
-                ("torque roll", 1e6, "uN m"), ("torque pitch", 1e6, "uN m"), ("torque yaw", 1e6, "uN m")),
+                ("torque roll", 1e6, "µN m"), ("torque pitch", 1e6, "µN m"), ("torque yaw", 1e6, "µN m")),
     "motion": (("x", 1e3, "mm"), ("y", 1e3, "mm"), ("z", 1e3, "mm"),
                ("roll", 180.0 / np.pi, "deg"), ("pitch", 180.0 / np.pi, "deg"), ("yaw", 180.0 / np.pi, "deg")),
 }  # fmt: skip

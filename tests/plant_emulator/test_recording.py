@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import resource
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -9,21 +11,42 @@ from typing import Any
 import pytest
 
 import controller.process as controller_process
+import plant_emulator.process
 from bridge.memory import memory_pair
 from bridge.process import StopFlag
+from bridge.ring_recorder import RingRecorder
 from bridge.sidecar import read_sidecar
 from controller.laws import make_law
 from controller.process import ControllerOptions, serve
 from plant_emulator.process import EmulatorOptions, fly, warm_up
 from plant_emulator.truth import load_truth
 from protocol.errors import FwavHilError, RunFolderError
+from protocol.log_scan import scan_tlog
 from protocol.tlog import read_tlog
-from tests.bridge.test_recorder import small_disk
 from tests.loop import scenario_of
 
 SCENARIO = scenario_of("flapper", duration_s=8.0)
 ROOM = 60_000
 """Bytes a file may have: far less than the 550 kB of log and 500 kB of ground truth that the run makes."""
+
+
+class RecorderOnSmallDisk(RingRecorder):
+    """A recorder whose files may not grow beyond ROOM: neither the writer's, nor from here on this process's."""
+
+    def __init__(self, *values: Any, **names: Any) -> None:
+        super().__init__(*values, **names)
+        limit = (ROOM, resource.RLIM_INFINITY)
+        resource.prlimit(self.writer_pid, resource.RLIMIT_FSIZE, limit)
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)  # `unlimited` takes it back
+
+
+@pytest.fixture(autouse=True)
+def unlimited(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(plant_emulator.process, "RingRecorder", RecorderOnSmallDisk)
+    scan_tlog(b"\0" * 100)  # its compiled code, once made, is a file that would not fit either
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def fly_on_small_disk(folder: Path, on_log_error: str) -> tuple[dict[str, Any] | FwavHilError, list[str]]:
@@ -38,7 +61,7 @@ def fly_on_small_disk(folder: Path, on_log_error: str) -> tuple[dict[str, Any] |
     warm_up(SCENARIO)
     controller_process.warm_up(law)
     options = EmulatorOptions(link="-", out=folder, on_log_error=on_log_error)
-    with ThreadPoolExecutor(1) as thread, small_disk(ROOM):
+    with ThreadPoolExecutor(1) as thread:
         service = thread.submit(
             lambda: serve(SCENARIO, law, theirs, ControllerOptions(link="-"), lambda _: None, StopFlag())
         )
