@@ -107,7 +107,7 @@ def test_the_gears_can_be_drawn_from_the_bus_alone(tmp_path: Path, uri: str) -> 
     scenario = short()
     fly(scenario, tmp_path, MotorLink(can=uri))
     points = read_encoders(tmp_path / "motor_bus.blf")
-    assert [len(of_axis) for of_axis in points] == [39] * 6
+    assert [len(of_axis) for of_axis in points] == [40] * 6
     width = 0.002 / 0.04  # (h - kappa)/chi over full scale, at 1 rad of travel
     apart = points[0][:, 1] - points[0][:, 0]
     assert np.abs(apart).max() == pytest.approx(width, rel=0.05)
