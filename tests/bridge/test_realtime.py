@@ -46,7 +46,7 @@ def by_name(settings: tuple[Setting, ...]) -> dict[str, Setting]:
 
 def test_whatever_is_granted_is_given_back() -> None:
     before = state()
-    files = set(os.listdir("/proc/self/fd"))
+    files = set(Path("/proc/self/fd").iterdir())
     core = max(os.sched_getaffinity(0))
     with real_time(core) as settings:
         inside = state()
@@ -58,7 +58,7 @@ def test_whatever_is_granted_is_given_back() -> None:
         assert given["garbage collector off"].granted
     assert state()[:5] == before[:5]
     assert gc.get_freeze_count() == 0
-    assert set(os.listdir("/proc/self/fd")) == files
+    assert set(Path("/proc/self/fd").iterdir()) == files
 
 
 def test_an_error_inside_gives_everything_back_too() -> None:
