@@ -49,9 +49,7 @@ def fly_both(
 ) -> Ends:
     """Run both ends to their end."""
     theirs = controller_scenario or scenario
-    emulator = EmulatorOptions(
-        link="-", clock=clock, out=out, wait_s=wait_s, legs=legs, motors=motors, spin_s=spin_s
-    )
+    emulator = EmulatorOptions(link="-", clock=clock, out=out, wait_s=wait_s, legs=legs, motors=motors, spin_s=spin_s)
     service_options = ControllerOptions(
         link="-", clock=clock, out=out, wait_s=wait_s, arm=arm, legs=legs, trigger=trigger, spin_s=spin_s
     )
