@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
-from scipy.signal import butter
 
 from controller.law import (
     ERROR,
@@ -47,6 +46,16 @@ class Estimator(NamedTuple):
     start_u: FloatArray
 
 
+def butterworth(order: int) -> FloatArray:
+    """Coefficients (order + 1,), highest first, of the monic Butterworth polynomial A(p) of unit cut-off.
+
+    Its zeros lie on the unit circle, evenly over the left half. The same to the bit as `scipy.signal.butter` gives (a test
+    holds it), without the second that importing that module adds to every start.
+    """
+    zeros = -np.exp(1j * np.pi * np.arange(1 - order, order, 2) / (2 * order))
+    return np.asarray(np.poly(zeros).real)
+
+
 def estimator(order: int, T: float, b: float, period: float, *, derivatives: int) -> Estimator:
     """The estimator of (18) with G_f of that order; `derivatives` is 2 where m = q, 1 where m = q' (T, period in s).
 
@@ -54,7 +63,7 @@ def estimator(order: int, T: float, b: float, period: float, *, derivatives: int
     first-order hold's share of the newest sample, w = x - G_2 m, so that sample k acts at step k.
     """
     size = order
-    falling = np.asarray(butter(order, 1.0, analog=True)[1])[1:]  # a_(n-1) .. a_0 of the monic A(p)
+    falling = butterworth(order)[1:]  # a_(n-1) .. a_0
     numerator = np.zeros(order)
     direct = 1.0 if derivatives == order else 0.0
     if derivatives < order:

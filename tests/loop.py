@@ -44,11 +44,15 @@ def fly_both(
     legs: bool = False,
     wait_s: float = 20.0,
     motors: MotorLink | None = None,
+    trigger: str = "sample",
+    spin_s: float | None = None,
 ) -> Ends:
     """Run both ends to their end."""
     theirs = controller_scenario or scenario
-    emulator = EmulatorOptions(link="-", clock=clock, out=out, wait_s=wait_s, legs=legs, motors=motors)
-    service_options = ControllerOptions(link="-", clock=clock, out=out, wait_s=wait_s, arm=arm, legs=legs)
+    emulator = EmulatorOptions(link="-", clock=clock, out=out, wait_s=wait_s, legs=legs, motors=motors, spin_s=spin_s)
+    service_options = ControllerOptions(
+        link="-", clock=clock, out=out, wait_s=wait_s, arm=arm, legs=legs, trigger=trigger, spin_s=spin_s
+    )
     law = make_law(theirs.law, theirs)
     plant_emulator.process.warm_up(scenario)
     controller_process.warm_up(law)

@@ -8,7 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.clock import MonotonicClock, PunctualClock, VirtualClock, local_stamp, unix_offset_ns, unix_time_us
+from bridge.clock import (
+    MonotonicClock,
+    PunctualClock,
+    VirtualClock,
+    local_stamp,
+    processor_time_ns,
+    unix_offset_ns,
+    unix_time_us,
+)
 
 
 class TestMonotonicClock:
@@ -147,3 +155,19 @@ class TestUnixOffset:
         monkeypatch.setattr(time, "time_ns", time_ns)
         assert unix_offset_ns() == offset_ns
         assert not pauses
+
+
+def test_a_spin_ends_when_its_time_has_come_and_no_sooner() -> None:
+    clock = MonotonicClock()
+    deadline_ns = clock.now_ns() + 2_000_000
+    clock.spin_until_ns(deadline_ns)
+    assert clock.now_ns() >= deadline_ns
+    virtual = VirtualClock(5)
+    virtual.spin_until_ns(9)
+    assert virtual.now_ns() == 9
+
+
+def test_processor_time_grows_with_work() -> None:
+    before = processor_time_ns()
+    sum(range(200_000))
+    assert processor_time_ns() > before

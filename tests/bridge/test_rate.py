@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.clock import VirtualClock
-from bridge.rate import RateKeeper
+from bridge.rate import LATE_BY_US, RateKeeper, choose_spin_ns, count_by_lateness, measure_spin_ns
 
 PERIODS_NS = st.integers(1, 10**10)
 PARTS = st.one_of(
@@ -130,3 +130,97 @@ def test_whatever_happens_there_is_never_a_burst(period_ns: int, parts: list[tup
         assert slot > last_slot
         last_slot = slot
         assert keeper.deadline_ns == START_NS + (slot + 1) * period_ns
+
+
+class Oversleeping(VirtualClock):
+    """A clock whose sleeps end late by a given time, and whose every look takes a moment; a spin ends in time."""
+
+    def __init__(self, late_ns: int, look_ns: int = 0) -> None:
+        super().__init__(START_NS)
+        self.late_ns, self.look_ns = late_ns, look_ns
+        self.spins = 0
+
+    def now_ns(self) -> int:
+        self.advance_ns(self.look_ns)
+        return super().now_ns()
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        if t_ns > super().now_ns():
+            super().sleep_until_ns(t_ns + self.late_ns)
+
+    def spin_until_ns(self, t_ns: int) -> None:
+        self.spins += 1
+        VirtualClock.sleep_until_ns(self, t_ns)
+
+
+@pytest.mark.parametrize(("spin_ns", "lateness_ns"), [(0, 70), (30, 40), (70, 0), (200, 0)])
+def test_a_spin_takes_up_what_the_sleep_is_late(spin_ns: int, lateness_ns: int) -> None:
+    clock = Oversleeping(70)
+    keeper = RateKeeper(clock, 1000, spin_ns)
+    keeper.start()
+    for _ in range(5):
+        keeper.sleep()
+        assert keeper.tick() == lateness_ns
+    assert clock.spins == (5 if spin_ns else 0)
+
+
+def test_what_remains_to_sleep_ends_where_the_spin_begins() -> None:
+    clock = VirtualClock(START_NS)
+    keeper = RateKeeper(clock, 1_000_000, 100_000)
+    keeper.start()
+    assert keeper.remaining_s() == pytest.approx(900e-6)
+    clock.advance_ns(900_000)
+    assert keeper.remaining_s() == 0.0
+    clock.advance_ns(99_999)
+    assert keeper.remaining_s() == 0.0
+    clock.advance_ns(1)
+    assert keeper.remaining_s() is None
+
+
+@given(PERIODS_NS, st.floats(0.0, 20.0))
+def test_a_schedule_taken_up_again_keeps_its_phase_and_counts_nothing(period_ns: int, periods: float) -> None:
+    clock, keeper = started(period_ns)
+    clock.advance_ns(int(periods * period_ns))
+    keeper.resume()
+    assert clock.now_ns() <= keeper.deadline_ns
+    assert (keeper.deadline_ns - START_NS) % period_ns == 0
+    assert keeper.deadline_ns - clock.now_ns() < period_ns or periods < 1
+    assert keeper.counters == {"late": 0, "slipped": 0}
+
+
+@given(st.lists(st.integers(0, 10**11)))
+def test_each_lateness_is_in_one_class_and_in_the_right_one(lateness_ns: list[int]) -> None:
+    counts = count_by_lateness(lateness_ns)
+    assert sum(counts.values()) == len(lateness_ns)
+    below = 0
+    for bound in LATE_BY_US:
+        below += counts[str(bound)]
+        assert below == sum(lateness <= 1000 * bound for lateness in lateness_ns)
+
+
+def test_the_summary_says_how_late_how_often_and_how_long_it_polled() -> None:
+    clock = VirtualClock(START_NS)
+    keeper = RateKeeper(clock, 1_000_000, 50_000)
+    keeper.start()
+    for lateness_ns in [0] * 8 + [30_000, 700_000]:
+        keeper.sleep()
+        clock.advance_ns(lateness_ns)
+        keeper.tick()
+    summary = keeper.summary()
+    assert summary["spin"] == 50.0
+    assert summary["max"] == 700.0
+    assert {name: count for name, count in summary["late_by"].items() if count} == {"5": 8, "50": 1, "1000": 1}
+
+
+@pytest.mark.parametrize(("late_ns", "spin_ns"), [(0, 0), (40_000, 50_000), (80_000, 100_000), (5_000_000, 100_000)])
+def test_the_spin_is_as_long_as_sleeps_are_late_and_a_tenth_of_the_period_at_most(late_ns: int, spin_ns: int) -> None:
+    assert measure_spin_ns(Oversleeping(late_ns), 1_000_000) == spin_ns
+
+
+def test_who_asks_for_a_spin_gets_it_up_to_half_a_period() -> None:
+    clock = Oversleeping(40_000)
+    assert choose_spin_ns(clock, 1_000_000, None, measure=False) == 0
+    assert choose_spin_ns(clock, 1_000_000, None, measure=True) == 50_000
+    assert choose_spin_ns(clock, 1_000_000, 0.0, measure=True) == 0
+    assert choose_spin_ns(clock, 1_000_000, 300e-6, measure=False) == 300_000
+    assert choose_spin_ns(clock, 1_000_000, 0.1, measure=True) == 500_000

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.integrate import solve_ivp
-from scipy.signal import lsim
+from scipy.signal import butter, lsim
 
 from controller.law import ERROR, POSITION, REFERENCE_ACCELERATION, VELOCITY, Realisation
-from controller.realise import Estimator, estimator, realise
+from controller.realise import Estimator, butterworth, estimator, realise
 from protocol.errors import ScenarioError
 from protocol.messages import FloatArray
 from protocol.scenario import Scenario, find_scenario, load_scenario
@@ -209,3 +209,8 @@ def test_state_feedback_takes_the_rate_of_the_error_as_it_comes(flapper: Scenari
         expected = r[:, REFERENCE_ACCELERATION] - k_1 * r[:, 4] - k_0 * r[:, ERROR] - uhat
         came = b * commands(law, axis, r, applied)
         assert came == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("order", range(1, 9))
+def test_the_butterworth_polynomial_is_scipys_to_the_bit(order: int) -> None:
+    assert butterworth(order).tolist() == butter(order, 1.0, analog=True)[1].tolist()

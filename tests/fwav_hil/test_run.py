@@ -342,3 +342,19 @@ def test_a_serial_line_carries_a_flight(tmp_path: Path) -> None:
     assert np.array_equal(
         load_truth(tmp_path / "run" / "ground_truth.npy")["q"], simulate(scenario_of("flapper", duration_s=0.4)).q
     )
+
+
+def test_a_real_time_run_with_everything_says_what_was_granted_and_refused(tmp_path: Path) -> None:
+    options = ["--clock", "realtime", "--realtime", "--trigger", "clock", "--duration", "0.3", "--link", FREE]
+    done = call("run", "flapper", *options, "--out", tmp_path / "run", "--json", "-", "--no-plots", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert summary["trigger"] == "clock"
+    for end in ("emulator", "controller"):
+        settings = summary["realtime"][end]
+        assert len(settings) == 6
+        assert sum(summary["lateness_us"][end]["late_by"].values()) >= 50
+        assert summary["processor_share"][end] > 0
+        for setting in settings:
+            assert setting["name"] in done.stderr, "the table tells it"
+            assert setting["granted"] or setting["said"]
