@@ -13,7 +13,7 @@ run: $(READY)
 	$(BIN)/fwav-hil run scenarios/flapper.toml
 
 test: $(READY)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: test lint types layers
 
