@@ -31,10 +31,10 @@ def test_500_hz_fit_921600_baud_and_1_khz_do_not() -> None:
     fits = link_budget(SERIAL, 500.0)
     assert fits.fits
     assert [way.capacity_bytes_per_s for way in fits.ways] == [92160.0] * 2
-    assert fits.ways[0].share == pytest.approx((500 * 126 + 21 + 10 * 48) / 92160)
-    assert fits.ways[1].share == pytest.approx((500 * 93 + 21 + 50 * (63 + 49)) / 92160)
+    assert fits.ways[0].share == pytest.approx((500 * 126 + 21 + 28 + 10 * 48) / 92160)
+    assert fits.ways[1].share == pytest.approx((500 * 93 + 21 + 28 + 50 * (63 + 49)) / 92160)
     assert not link_budget(SERIAL, 1000.0).fits
-    assert link_budget(SERIAL, 1000.0).highest_rate_hz == (92160 - 501) // 126
+    assert link_budget(SERIAL, 1000.0).highest_rate_hz == (92160 - 529) // 126
 
 
 def test_the_delay_is_the_bytes_of_the_tick_and_of_the_command() -> None:
