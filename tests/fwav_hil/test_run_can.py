@@ -72,9 +72,8 @@ def test_three_processes_fly_as_the_simulation_does(tmp_path: Path) -> None:
         input=(tmp_path / "bus.log").read_text(), capture_output=True, text=True, check=True, timeout=PATIENCE_S,
     ).stdout  # fmt: skip
     assert len(re.findall(r":: Sync\(", decoded)) == 100
-    assert (
-        len(re.findall(r":: Encoders_gamma\(", decoded)) == 39
-    )  # at 100 Hz; what follows the last answer nobody reads
+    # At 100 Hz over 0.4 s; whether the last one still gets into the record is a race between the ends of two processes.
+    assert len(re.findall(r":: Encoders_gamma\(", decoded)) in (39, 40)
 
 
 def test_a_killed_motor_process_is_a_counted_outage_a_safe_output_and_a_recovery(tmp_path: Path) -> None:
