@@ -58,7 +58,8 @@ def test_whatever_is_granted_is_given_back() -> None:
         assert given["garbage collector off"].granted
     assert state()[:5] == before[:5]
     assert gc.get_freeze_count() == 0
-    assert set(Path("/proc/self/fd").iterdir()) == files
+    # Fewer where the collection inside closed what an earlier test had left behind.
+    assert set(Path("/proc/self/fd").iterdir()) <= files
 
 
 def test_an_error_inside_gives_everything_back_too() -> None:
