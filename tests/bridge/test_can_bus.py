@@ -15,6 +15,7 @@ from bridge.can_bus import CanBus, CanUri, parse_can_uri
 from bridge.clock import VirtualClock
 from protocol.can_frame import CanFrame
 from protocol.errors import CanBusLostError, LinkClosedError, LinkError, LinkUriError
+from tests.multicast import skip_without_multicast
 
 PATIENCE_S = 10.0
 FRAMES = [
@@ -27,7 +28,8 @@ _names = itertools.count()
 
 
 def free_group() -> str:
-    """A multicast URI with a port that nobody on this machine uses."""
+    """A multicast URI with a port that nobody on this machine uses; the test is skipped where there is no multicast."""
+    skip_without_multicast()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("", 0))
         return f"udp_multicast:239.74.163.2:{probe.getsockname()[1]}"
