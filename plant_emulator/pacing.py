@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from bridge.clock import Clock, unix_time_us
 from bridge.endpoint import VEHICLE, Endpoint
@@ -25,6 +26,17 @@ RESEND_AFTER_S = (0.010, 0.020, 0.040, 0.080, 0.160, 0.320, 0.640, 0.730)
 """Waits of the exact profile: after each the tick is sent again; after the last, 2 s in all, the run ends."""
 
 
+class Parts(NamedTuple):
+    """What a pacing brings together, whichever it is; period_ns: from tick to tick."""
+
+    emulator: Emulator
+    endpoint: Endpoint
+    log: TlogWriter | None
+    clock: Clock
+    stop: StopFlag
+    period_ns: int
+
+
 class Pacing(abc.ABC):
     """Carries ticks across the link.
 
@@ -33,21 +45,8 @@ class Pacing(abc.ABC):
     latencies_ns    for each command, wall time from the sending of its sample to the command's arrival
     """
 
-    def __init__(
-        self,
-        emulator: Emulator,
-        endpoint: Endpoint,
-        log: TlogWriter | None,
-        clock: Clock,
-        stop: StopFlag,
-        period_ns: int,
-    ) -> None:
-        self.emulator = emulator
-        self.endpoint = endpoint
-        self.log = log
-        self.clock = clock
-        self.stop = stop
-        self.period_ns = period_ns
+    def __init__(self, parts: Parts) -> None:
+        self.emulator, self.endpoint, self.log, self.clock, self.stop, self.period_ns = parts
         self.keeper: RateKeeper | None = None
         self.latencies_ns: list[int] = []
         self.counters: dict[str, int] = {}
@@ -94,21 +93,16 @@ class Lockstep(Pacing):
 
     def __init__(
         self,
-        emulator: Emulator,
-        endpoint: Endpoint,
-        log: TlogWriter | None,
-        clock: Clock,
-        stop: StopFlag,
-        period_ns: int,
+        parts: Parts,
         *,
         ticks: int,
         delay_ns: int,
         keeper: RateKeeper | None,
     ) -> None:
-        super().__init__(emulator, endpoint, log, clock, stop, period_ns)
+        super().__init__(parts)
         self._delay_ns = delay_ns
         self._keeper = self.keeper = keeper
-        self._ahead_until_ns = 0 if keeper else ticks * period_ns
+        self._ahead_until_ns = 0 if keeper else ticks * self.period_ns
         """Ticks before this time may leave the moment the answer to the one before them is there."""
         self._sent_ns = self._answered_ns = 0
         self._datagram = b""
@@ -230,23 +224,18 @@ class RealTime(Pacing):
 
     def __init__(
         self,
-        emulator: Emulator,
-        endpoint: Endpoint,
-        log: TlogWriter | None,
-        clock: Clock,
-        stop: StopFlag,
-        period_ns: int,
+        parts: Parts,
         *,
         spin_ns: int = 0,
     ) -> None:
-        super().__init__(emulator, endpoint, log, clock, stop, period_ns)
-        self._keeper = self.keeper = RateKeeper(clock, period_ns, spin_ns)
+        super().__init__(parts)
+        self._keeper = self.keeper = RateKeeper(self.clock, self.period_ns, spin_ns)
         self._sent: dict[int, int] = {}
         self._newest_ns = -1
         self._begun = False
-        self.time_sync = TimeSync(endpoint, clock)
+        self.time_sync = TimeSync(self.endpoint, self.clock)
         self.legs: tuple[LegTable, LegTable] | None = None
-        self._heard_ns = self._due_ns = clock.now_ns()
+        self._heard_ns = self._due_ns = self.clock.now_ns()
         self.counters = {
             **self._keeper.counters,
             "unanswered": 0,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from bridge.clock import Clock, MonotonicClock, processor_time_ns
+from bridge.clock import MonotonicClock, processor_time_ns
 from bridge.endpoint import VEHICLE, Endpoint, refuse_other_scenario
 from bridge.faults import DelayedLink
 from bridge.legs import ANSWER_COLUMNS, EMULATOR_FILE, TICK_COLUMNS, LegTable, save_legs
@@ -22,7 +22,7 @@ from bridge.ring_recorder import RingRecorder
 from bridge.sidecar import LinkOfLog
 from bridge.summary import make_folder, percentiles_us, refuse_existing_run, write_json, write_text
 from plant_emulator.emulator import Emulator
-from plant_emulator.pacing import Lockstep, Pacing, RealTime
+from plant_emulator.pacing import Lockstep, Pacing, Parts, RealTime
 from plant_emulator.truth import TruthWriter
 from protocol import mavlink_map
 from protocol.errors import FwavHilError, PeerMissingError, RunFolderError, UsageError
@@ -114,7 +114,8 @@ def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report
         ):
             emulator = Emulator(scenario, endpoint, truth, motors)
             report_settings(report, settings)
-            pacing = _pacing(scenario, options, emulator, endpoint, log, MonotonicClock(), stop, settings)
+            parts = Parts(emulator, endpoint, log, MonotonicClock(), stop, scenario.period_ns)
+            pacing = _pacing(scenario, options, parts, settings)
             report({"event": "waiting", "link": link.uri})
             meet_controller(scenario, options.wait_s, endpoint, stop)
             report({"event": "started", "peer": link.peer})
@@ -188,24 +189,12 @@ def _motors(
     )
 
 
-def _pacing(
-    scenario: Scenario,
-    options: EmulatorOptions,
-    emulator: Emulator,
-    endpoint: Endpoint,
-    log: TlogWriter | None,
-    clock: Clock,
-    stop: StopFlag,
-    settings: Settings,
-) -> Pacing:
+def _pacing(scenario: Scenario, options: EmulatorOptions, parts: Parts, settings: Settings) -> Pacing:
     if options.clock == "realtime":
-        spin_ns = choose_spin_ns(clock, scenario.period_ns, options.spin_s, measure=has_own_core(settings))
-        return RealTime(emulator, endpoint, log, clock, stop, scenario.period_ns, spin_ns=spin_ns)
-    keeper = RateKeeper(clock, round(scenario.period_ns / options.speed)) if options.speed else None
-    return Lockstep(
-        emulator, endpoint, log, clock, stop, scenario.period_ns,
-        ticks=scenario.ticks, delay_ns=scenario.delay_ns, keeper=keeper,
-    )  # fmt: skip
+        spin_ns = choose_spin_ns(parts.clock, scenario.period_ns, options.spin_s, measure=has_own_core(settings))
+        return RealTime(parts, spin_ns=spin_ns)
+    keeper = RateKeeper(parts.clock, round(scenario.period_ns / options.speed)) if options.speed else None
+    return Lockstep(parts, ticks=scenario.ticks, delay_ns=scenario.delay_ns, keeper=keeper)
 
 
 def meet_controller(scenario: Scenario, wait_s: float, endpoint: Endpoint, stop: StopFlag) -> None:

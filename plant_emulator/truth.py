@@ -8,11 +8,11 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 import numpy.typing as npt
 
+from protocol.append_file import AppendFile
 from protocol.errors import RunFolderError
 from protocol.messages import FloatArray
 
@@ -31,7 +31,7 @@ ROW = np.dtype(
 _BLOCK = 1024
 
 
-class TruthWriter:
+class TruthWriter(AppendFile):
     """Appends rows; the file's header is rewritten at each flush, so the file is whole up to the last one.
 
     Where the disk refuses, RunFolderError is raised; with `tell`, that hears of it once instead, and rows are left out from
@@ -39,7 +39,7 @@ class TruthWriter:
     """
 
     def __init__(self, path: Path, tell: Callable[[str], None] | None = None) -> None:
-        self.path = path
+        super().__init__(path, "the ground truth")
         self.lost = 0
         self._tell = tell
         self._block = np.zeros(_BLOCK, dtype=ROW)
@@ -48,14 +48,10 @@ class TruthWriter:
         self._pending = 0
         self._count = 0
         try:
-            self._file = path.open("wb", buffering=0)
-        except OSError as error:
-            raise RunFolderError(f"cannot write the ground truth {path}: {error.strerror}") from None
-        try:
             self._write(_header(0))
         except OSError as error:
             self._file.close()
-            raise RunFolderError(f"cannot write the ground truth {path}: {error.strerror}") from None
+            raise self._refused(error) from None
 
     def append(self, t_ns: int, row: FloatArray) -> None:
         """Add the row of time t_ns: the numbers (31,) of `integrate.fill_row`, whose first is left out."""
@@ -80,11 +76,10 @@ class TruthWriter:
             self._file.seek(0)
             self._write(_header(self._count))
         except OSError as error:
-            sentence = f"cannot write the ground truth {self.path}: {error.strerror}"
             if self._tell is None:
-                raise RunFolderError(sentence) from None
+                raise self._refused(error) from None
             self._leave_out()
-            self._tell(sentence)
+            self._tell(str(self._refused(error)))
 
     def _leave_out(self) -> None:
         self.lost += self._pending
@@ -95,22 +90,6 @@ class TruthWriter:
         rest = memoryview(data)
         while rest:
             rest = rest[self._file.write(rest) :]
-
-    def close(self) -> None:
-        """Flush and close; may be called again."""
-        if not self._file.closed:
-            try:
-                self.flush()
-            finally:
-                self._file.close()
-
-    def __enter__(self) -> TruthWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def _header(count: int) -> bytes:

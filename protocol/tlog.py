@@ -8,10 +8,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
-from protocol.errors import RunFolderError
+from protocol.append_file import AppendFile
 from protocol.log_scan import scan_tlog
 from protocol.mavlink_codec import Frame
 
@@ -20,16 +18,12 @@ _FLUSH_BYTES = 1 << 16
 _SIGNED = 0x01
 
 
-class TlogWriter:
+class TlogWriter(AppendFile):
     """Writes frames, gathered into large writes. Raises `RunFolderError` where the file cannot be written."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        super().__init__(path, "the log")
         self._pending = bytearray()
-        try:
-            self._file = path.open("wb", buffering=0)
-        except OSError as error:
-            raise RunFolderError(f"cannot write the log {path}: {error.strerror}") from None
 
     def write(self, t_us: int, frame: bytes) -> None:
         """Log one frame."""
@@ -50,23 +44,7 @@ class TlogWriter:
             while self._pending:  # a nearly full disk takes a part, and tells why only when asked again
                 del self._pending[: self._file.write(self._pending)]
         except OSError as error:
-            raise RunFolderError(f"cannot write the log {self.path}: {error.strerror}") from None
-
-    def close(self) -> None:
-        """Flush and close; may be called again."""
-        if not self._file.closed:
-            try:
-                self.flush()
-            finally:
-                self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+            raise self._refused(error) from None
 
 
 def read_tlog(path: Path) -> Iterator[tuple[int, Frame]]:

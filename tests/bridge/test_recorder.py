@@ -6,11 +6,9 @@ import json
 import multiprocessing
 import os
 import random
-import resource
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +23,7 @@ from fwav_hil.record import Listener
 from protocol.errors import RunFolderError
 from protocol.mavlink_codec import FrameWriter, layout
 from protocol.tlog import read_tlog
+from tests.disk import small_disk
 
 HEARTBEAT = layout("HEARTBEAT")
 ONE_LINK = (LinkOfLog("mem://a", sent_by=((1, 191),)),)
@@ -59,17 +58,6 @@ def wait_until(condition: Callable[[], bool]) -> None:
 def is_told(log: Recorder, said: list[str]) -> bool:
     log.flush()
     return bool(said)
-
-
-@contextmanager
-def small_disk(room: int) -> Iterator[None]:
-    """As good as a disk with little room: no file of this process may grow beyond it (so keep it short)."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 class TestLog:

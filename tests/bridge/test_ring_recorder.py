@@ -17,7 +17,8 @@ from bridge.clock import MonotonicClock
 from bridge.ring_recorder import RingRecorder
 from bridge.sidecar import LinkOfLog, read_sidecar, sidecar_path
 from protocol.errors import RunFolderError
-from tests.bridge.test_recorder import numbered, numbers_in, small_disk, wait_until
+from tests.bridge.test_recorder import numbered, numbers_in, wait_until
+from tests.disk import small_disk
 
 LINK = LinkOfLog("mem://a", sent_by=((1, 191),))
 FRAMES = numbered(3000)

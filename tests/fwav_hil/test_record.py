@@ -22,7 +22,8 @@ from bridge.sidecar import link_numbers, read_sidecar
 from fwav_hil.record import record
 from protocol.errors import LinkError, PeerMissingError, RunFolderError
 from protocol.log_scan import scan_tlog
-from tests.bridge.test_recorder import numbered, small_disk, wait_until
+from tests.bridge.test_recorder import numbered, wait_until
+from tests.disk import small_disk
 from tests.fwav_hil.replay.conftest import Command, fwav_hil
 
 __all__ = ["fwav_hil"]

@@ -13,7 +13,7 @@ from bridge.endpoint import VEHICLE, Endpoint
 from bridge.link import Link
 from bridge.process import StopFlag
 from plant_emulator.emulator import Emulator
-from plant_emulator.pacing import RealTime
+from plant_emulator.pacing import Parts, RealTime
 from plant_emulator.process import warm_up
 from protocol import mavlink_map
 from protocol.errors import PeerLostError
@@ -73,7 +73,7 @@ def fly(ticks: int, answers: Callable[[FrameWriter, int], list[bytes]], *, waite
     link = Scripted(clock, lambda tick: answers(writer, tick))
     endpoint = Endpoint(link, 1, SCENARIO.wire.emulator_component)
     emulator = Emulator(SCENARIO, endpoint, None)
-    pacing = RealTime(emulator, endpoint, None, clock, StopFlag(), PERIOD_NS)
+    pacing = RealTime(Parts(emulator, endpoint, None, clock, StopFlag(), PERIOD_NS))
     clock.advance_ns(waited_ns)
     for tick in range(ticks):
         pacing.exchange(tick, tick * PERIOD_NS)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import random
-import resource
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +18,7 @@ from protocol.errors import RunFolderError
 from protocol.mavlink_codec import FrameWriter, layout, layouts_by_id
 from protocol.streams import STREAMS
 from protocol.tlog import TlogWriter, read_tlog
+from tests.disk import small_disk
 
 Records = list[tuple[int, bytes]]
 STAMP_BYTES = 8
@@ -162,17 +160,6 @@ class TestDamage:
             _read(tmp_path / name)
 
 
-@contextlib.contextmanager
-def _small_disk(room: int) -> Iterator[None]:
-    """As good as a disk with little room: no file of this process may grow beyond it (so keep it short)."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-
-
 class TestWriting:
     @pytest.mark.parametrize("name", ["no/such/folder/a.tlog", "."])
     def test_a_path_that_cannot_be_written_is_an_error_that_names_it(self, tmp_path: Path, name: str) -> None:
@@ -204,7 +191,7 @@ class TestWriting:
         log = TlogWriter(tmp_path / "a.tlog")
         for record in RECORDS:
             log.write(*record)
-        with _small_disk(1000), pytest.raises(RunFolderError, match=r"a\.tlog: File too large"):
+        with small_disk(1000), pytest.raises(RunFolderError, match=r"a\.tlog: File too large"):
             log.flush()
         assert (tmp_path / "a.tlog").stat().st_size == 1000
         # Once there is room again, not a byte is missing.
