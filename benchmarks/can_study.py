@@ -16,7 +16,8 @@ import msgspec
 import numpy as np
 
 from bridge.can_load import plan_bus
-from fwav_hil.run import MotorsOnCan, RunFailedError, RunOptions, new_folder, run
+from fwav_hil.run import MotorsOnCan, RunFailedError, RunOptions, run
+from fwav_hil.run_folder import new_folder
 from fwav_hil.score import scores
 from fwav_hil.simulate import simulate
 from protocol.messages import AXES

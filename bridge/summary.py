@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from protocol.errors import RunFolderError
 
@@ -81,5 +80,7 @@ def percentiles_us(durations_ns: Sequence[int]) -> dict[str, float | None]:
     """p50, p99, p999 and max in microseconds; None each where there is nothing to count."""
     if not durations_ns:
         return dict.fromkeys(("p50", "p99", "p999", "max"))
+    import numpy as np  # here: see `protocol.messages`
+
     p50, p99, p999, most = np.percentile(np.asarray(durations_ns), (50, 99, 99.9, 100)) / 1e3
     return {"p50": float(p50), "p99": float(p99), "p999": float(p999), "max": float(most)}

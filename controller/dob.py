@@ -9,8 +9,8 @@ the baseline's gains or from its missing feed-forward.
 
 from __future__ import annotations
 
-from controller.law import Realisation
 from controller.pd import pd_gains
+from controller.realisation import Realisation
 from protocol.scenario import Scenario
 
 

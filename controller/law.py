@@ -19,6 +19,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from controller.laws import velocity_sentence
+from controller.realisation import INPUTS, Realisation
 from controller.reference import ReferenceParameters, evaluate_reference, reference_parameters
 from protocol.compiled import Packed, compiled, pack, views
 from protocol.errors import UsageError
@@ -26,32 +28,6 @@ from protocol.frames import rotate_to_body, rotate_to_inertial, unwrap_angle, wr
 from protocol.mavlink_map import command_from_wire, command_to_wire
 from protocol.messages import FloatArray
 from protocol.scenario import Actuators, Scenario
-
-INPUTS = 5
-POSITION, ERROR, REFERENCE_ACCELERATION, VELOCITY, ERROR_RATE = range(INPUTS)
-
-
-class Realisation(NamedTuple):
-    """A law as discrete state-space matrices per axis (first index), n states each, at one sampling period.
-
-    A (6, n, n), B (6, n, INPUTS), B_tau (6, n), C (6, n), D (6, INPUTS), bias (6,): see the module's equations; tau is in
-    the inertial frame, N and N m. C_u (6, n), D_u (6, INPUTS): estimate of u_d (m/s^2, rad/s^2). start_r (6, n, INPUTS),
-    start_u (6, n): x_0 = start_r r_0 + start_u uhat_0. uhat0 (6,): the estimate at the start. memory_s (6,): a gap of this
-    length or longer makes the axis start again from its last estimate.
-    """
-
-    A: FloatArray
-    B: FloatArray
-    B_tau: FloatArray
-    C: FloatArray
-    D: FloatArray
-    bias: FloatArray
-    C_u: FloatArray
-    D_u: FloatArray
-    start_r: FloatArray
-    start_u: FloatArray
-    uhat0: FloatArray
-    memory_s: FloatArray
 
 
 class Output(NamedTuple):
@@ -301,7 +277,7 @@ class Law:
         """
         if q_dot is None:
             if self.needs_velocity:
-                raise UsageError(self.velocity_sentence())
+                raise UsageError(velocity_sentence(self.name))
             q_dot = _NO_VELOCITY
         packed_control_step(self.packed, state.packed, t_ns, q, q_dot)
         return state.tau.copy()
@@ -310,13 +286,6 @@ class Law:
     def restart(state: LawState) -> None:
         """Let the next sample start the law as its first did; what was counted stays."""
         state.fresh[0] = 1
-
-    def velocity_sentence(self) -> str:
-        """Why a state-feedback law cannot run on a link."""
-        return (
-            f"the law '{self.name}' needs velocities, which the link does not carry: "
-            "use it in `fwav-hil simulate`, or choose an output-feedback law such as 'ude'"
-        )
 
     @staticmethod
     def counts(state: LawState) -> dict[str, int]:

@@ -1,39 +1,88 @@
-"""The registry of the control laws: one line each."""
+"""The registry of the control laws: one line each. A law's own file is loaded when the law is made."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+import importlib
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, NamedTuple
 
-from controller.dob import dob, dob_ff
-from controller.law import Law, Realisation
-from controller.pd import pd
-from controller.ude import ude, ude_state, uncompensated
-from protocol.errors import UsageError
+from protocol.errors import ScenarioError, UsageError
 from protocol.scenario import Scenario
+
+if TYPE_CHECKING:
+    from controller.law import Law
+    from controller.realisation import Realisation
 
 
 class LawEntry(NamedTuple):
-    """How to build a law, whether it needs velocities, and what it is in a few words."""
+    """Where a law is built (module:function), whether it needs velocities, and what it is in a few words."""
 
-    build: Callable[[Scenario], Realisation]
+    place: str
     needs_velocity: bool
     summary: str
 
 
-LAWS = {
-    "ude": LawEntry(ude, False, "the paper's output feedback with the estimator (21)"),
-    "ude_state": LawEntry(ude_state, True, "the paper's state feedback (20); in `simulate` only"),
-    "pd": LawEntry(pd, False, "PD"),
-    "dob": LawEntry(dob, False, "PD and a disturbance observer"),
-    "dob_ff": LawEntry(dob_ff, False, "the same with feed-forward of the reference's acceleration"),
-    "uncompensated": LawEntry(uncompensated, False, "the UDE law without its estimate (G_f = 0)"),
-}
+LAWS: Mapping[str, LawEntry] = MappingProxyType(
+    {
+        "ude": LawEntry("controller.ude:ude", False, "the paper's output feedback with the estimator (21)"),
+        "ude_state": LawEntry("controller.ude:ude_state", True, "the paper's state feedback (20); in `simulate` only"),
+        "pd": LawEntry("controller.pd:pd", False, "PD"),
+        "dob": LawEntry("controller.dob:dob", False, "PD and a disturbance observer"),
+        "dob_ff": LawEntry(
+            "controller.dob:dob_ff", False, "the same with feed-forward of the reference's acceleration"
+        ),
+        "uncompensated": LawEntry("controller.ude:uncompensated", False, "the UDE law without its estimate (G_f = 0)"),
+    }
+)
+
+
+def law_entry(name: str) -> LawEntry:
+    """What is known of the law called `name`. Raises UsageError for a name there is not."""
+    if name not in LAWS:
+        raise UsageError(f"there is no law '{name}': choose one of {', '.join(LAWS)}")
+    return LAWS[name]
+
+
+def refuse_on_a_link(scenario: Scenario) -> None:
+    """Raise UsageError or ScenarioError where the scenario's law cannot fly on a link, which carries no velocities.
+
+    The same errors come from making and stepping the law; this asks for none of what that needs.
+    """
+    if law_entry(scenario.law).needs_velocity:
+        raise UsageError(velocity_sentence(scenario.law))
+    check_order(scenario, 2)
+
+
+def check_order(scenario: Scenario, least: int) -> None:
+    """Raise ScenarioError where the filter G_f cannot be differentiated `least` times."""
+    if scenario.control.order < least:
+        raise ScenarioError(
+            f"scenario {scenario.name}, control.order: output feedback needs a filter of order {least} or more, "
+            f"this one has {scenario.control.order}: set control.order = {least}"
+        )
+
+
+def velocity_sentence(name: str) -> str:
+    """Why a state-feedback law cannot run on a link."""
+    return (
+        f"the law '{name}' needs velocities, which the link does not carry: "
+        "use it in `fwav-hil simulate`, or choose an output-feedback law such as 'ude'"
+    )
 
 
 def make_law(name: str, scenario: Scenario) -> Law:
-    """The law called `name` for the scenario's gains and rate. Raises UsageError for a name there is not."""
-    if name not in LAWS:
-        raise UsageError(f"there is no law '{name}': choose one of {', '.join(LAWS)}")
-    entry = LAWS[name]
-    return Law(name, scenario, entry.build(scenario), needs_velocity=entry.needs_velocity)
+    """The law called `name` for the scenario's gains and rate.
+
+    Raises UsageError for a name there is not, ScenarioError where the scenario's filter is none for that law.
+    """
+    from controller.law import Law
+
+    return Law(name, scenario, make_realisation(name, scenario), needs_velocity=law_entry(name).needs_velocity)
+
+
+def make_realisation(name: str, scenario: Scenario) -> Realisation:
+    """The matrices of the law called `name`, without its kernels. Raises as `make_law`."""
+    module, _, function = law_entry(name).place.partition(":")
+    realisation: Realisation = getattr(importlib.import_module(module), function)(scenario)
+    return realisation

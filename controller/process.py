@@ -24,7 +24,7 @@ from bridge.summary import make_folder, write_json
 from bridge.timesync import TimeSync
 from controller.actuation import HilActuation
 from controller.law import Law
-from controller.laws import make_law
+from controller.laws import make_law, refuse_on_a_link
 from controller.quick import QuickAnswers
 from controller.telemetry import HilTelemetry
 from controller.vehicle import Vehicle
@@ -140,10 +140,12 @@ class Controller:
         """Say hello until the first sample comes."""
         give_up_ns = self.clock.now_ns() + round(self.options.wait_s * 1e9)
         hello = Due(1.0 / HELLO_PERIOD_S)
+        said = False
         while (now_ns := self.clock.now_ns()) < give_up_ns:
             self.stop.check()
-            if hello.at(now_ns):
+            if hello.at(now_ns) or said != self.vehicle.agreed:
                 self.endpoint.send(self.vehicle.hello())
+                said = self.vehicle.agreed
             self._look(HELLO_PERIOD_S)
             if self._samples or self.vehicle.ended:
                 return
@@ -329,9 +331,8 @@ def run_controller(scenario: Scenario, options: ControllerOptions, report: Repor
 
     Raises the errors of `protocol.errors`; a law that needs velocities is refused.
     """
+    refuse_on_a_link(scenario)
     law = make_law(scenario.law, scenario)
-    if law.needs_velocity:
-        raise UsageError(law.velocity_sentence())
     if options.legs and (options.clock != "realtime" or not options.out):
         raise UsageError("--legs notes times of a real-time run in a folder: add --clock realtime and --out DIR")
     warm_up(law)

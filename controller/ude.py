@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from controller.law import Realisation
+from controller.realisation import Realisation
 from controller.realise import realise
 from protocol.scenario import Scenario
 

@@ -170,14 +170,13 @@ def run_command(
     )
     from bridge.link import refuse_rate_that_cannot_fit
     from bridge.realtime import check_real_time
-    from controller.laws import make_law
+    from controller.laws import refuse_on_a_link
     from fwav_hil.compile import compile_kernels
-    from fwav_hil.run import MotorsOnCan, RunOptions, check_link, new_folder, run
+    from fwav_hil.run import MotorsOnCan, RunOptions, check_link, run
+    from fwav_hil.run_folder import new_folder
     from protocol.errors import FwavHilError, UsageError
 
-    chosen_law = make_law(chosen.law, chosen)
-    if chosen_law.needs_velocity:
-        raise UsageError(chosen_law.velocity_sentence())
+    refuse_on_a_link(chosen)
     check_real_time(clock, realtime=realtime, trigger=trigger)
     check_link(link)
     if clock == "realtime":
@@ -237,7 +236,7 @@ def simulate_command(
 ) -> None:
     """Fly SCENARIO in this process: the same laws, plant, sampling, delays and noise, compiled, without a link."""
     chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
-    from fwav_hil.run import new_folder
+    from fwav_hil.run_folder import new_folder
     from fwav_hil.simulated import simulate_run, simulate_spread
     from fwav_hil.tables import print_spread, print_summary
     from protocol.errors import DivergenceError, UsageError
@@ -275,7 +274,7 @@ def report_command(folder: Path, plots: bool, json_path: Path | None) -> None:
 def _finish(folder: Path, json_path: Path | None, *, plots: bool) -> None:
     """Draw, print and hand on what a run folder holds; says where it is even where it holds nothing yet."""
     from bridge.summary import read_json, write_json
-    from fwav_hil.report import FILES
+    from fwav_hil.run_folder import FILES
     from fwav_hil.tables import print_summary
 
     path = folder / FILES["summary"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from protocol.compiled import kernels_are_warm, mark_warm
+from protocol.kernel_cache import kernels_are_warm, mark_warm
 from protocol.scenario import Scenario
 
 

@@ -1,9 +1,4 @@
-"""The results of a run: from its folder to summary.json, plots and a table; it can be done again at any time.
-
-scenario.toml      the scenario in full           run.tlog            every frame, both directions; run.tlog.json: its sidecar
-ground_truth.npy   one row a tick                 emulator.json, controller.json   counters of each end
-summary.json       scores, latency, counters      *.png               plots
-"""
+"""The results of a run: from its folder to summary.json, plots and a table; it can be done again at any time."""
 
 from __future__ import annotations
 
@@ -15,21 +10,11 @@ import numpy.typing as npt
 
 from bridge.summary import read_json, write_json
 from fwav_hil import __version__
+from fwav_hil.run_folder import FILES
 from fwav_hil.score import scores
 from plant_emulator.truth import load_truth
 from protocol.scenario import NANOSECONDS, Scenario, load_scenario
 
-FILES = {
-    "log": "run.tlog",
-    "sidecar": "run.tlog.json",
-    "ground_truth": "ground_truth.npy",
-    "scenario": "scenario.toml",
-    "emulator": "emulator.json",
-    "controller": "controller.json",
-    "motor": "motor.json",
-    "can_log": "motor_bus.blf",
-    "summary": "summary.json",
-}
 _DROPPED = (
     "bad_crc",
     "garbage_bytes",

@@ -1,28 +1,30 @@
-"""One run: emulator and controller as two processes on a link, watched to their end, and their results put together."""
+"""One run: emulator and controller as two processes on a link, watched to their end, and their results put together.
+
+The two need a second to get ready. They are started first, and what this process needs besides is loaded meanwhile.
+"""
 
 from __future__ import annotations
 
-import os
 import sys
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import msgspec
-import numpy as np
 
-from bridge.clock import local_stamp
 from bridge.link import parse_link_uri
 from bridge.process import StopFlag
-from bridge.summary import make_folder, refuse_existing_run, write_text
 from fwav_hil.children import Child, listen
 from fwav_hil.motor_child import MotorKeeper
-from fwav_hil.progress import Progress
-from fwav_hil.report import FILES, summarise
-from fwav_hil.studies.margin import budget_line
+from fwav_hil.placement import Placement, choose_placement
+from fwav_hil.run_folder import FILES
 from protocol.errors import FwavHilError, Interrupted, PeerError, UsageError
 from protocol.scenario import NANOSECONDS, Scenario
+
+if TYPE_CHECKING:
+    from fwav_hil.progress import Progress
+    from fwav_hil.studies.margin import Budget
 
 _IN_TO_OUT = {"udpin": "udpout", "tcpin": "tcpout"}
 
@@ -72,60 +74,8 @@ class RunFailedError(FwavHilError):
         self.exit_code = exit_code
 
 
-def new_folder(scenario: Scenario, out: Path | None) -> Path:
-    """The folder of a new run: `out`, or one named after the scenario and the time. Raises RunFolderError."""
-    folder = out or Path("runs") / f"{scenario.name}-{scenario.law}-{local_stamp()}"
-    refuse_existing_run(folder)
-    make_folder(folder)
-    write_text(folder / FILES["scenario"], scenario.to_toml())
-    return folder
-
-
-class Placement(msgspec.Struct, frozen=True):
-    """Where the two processes of a run sit, and how they wait for each other.
-
-    In lockstep one process waits while the other works. Asleep on a core of its own it costs the wake-up of that core at
-    each hand-over; on a shared core it costs a switch of contexts, and cold caches; polling on a core of its own it costs
-    neither, only that core. So: two cores and a short spin where there are two, one core where not. In real time each
-    process sleeps, and the scheduler places it; with `--realtime` each has a core of its own, if there are two, and polls
-    the end of a wait only.
-    """
-
-    text: str
-    emulator: tuple[str, ...] = ()
-    controller: tuple[str, ...] = ()
-
-
 _PATIENCE = 10
 """Looks, a tenth of a second apart or less, that a process gets to end by itself after the other one has failed."""
-
-SPIN_US = "500"
-"""How long a lockstep process polls before it sleeps: several ticks' worth; longer waits are stalls."""
-
-
-def choose_placement(clock: str, *, realtime: bool = False, spin_us: int | None = None) -> Placement:
-    """The placement for a clock mode on this machine."""
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    wanted = () if spin_us is None else ("--spin-us", str(spin_us))
-    if realtime:
-        told = ("--realtime", *wanted)
-        if len(cores) < 2:
-            return Placement("both processes on the one core there is, sleeping while they wait", told, told)
-        return Placement(
-            f"a core each (emulator {cores[-1]}, controller {cores[-2]}), polling the end of each wait",
-            ("--core", str(cores[-1]), *told),
-            ("--core", str(cores[-2]), *told),
-        )
-    if clock == "lockstep" and len(cores) > 1:
-        spin = wanted or ("--spin-us", SPIN_US)
-        return Placement(
-            f"a core each (emulator {cores[-1]}, controller {cores[-2]}), polling up to {spin[1]} us before sleeping",
-            ("--core", str(cores[-1]), *spin),
-            ("--core", str(cores[-2]), *spin),
-        )
-    if clock == "lockstep" and cores:
-        return Placement("both processes on the one core there is, sleeping while they wait", wanted, wanted)
-    return Placement("placed by the scheduler, sleeping while they wait", wanted, wanted)
 
 
 def check_link(uri: str) -> None:
@@ -150,49 +100,26 @@ def check_motors(scenario: Scenario, motors: MotorsOnCan) -> None:
 def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]:
     """Run both processes; returns the summary, which is also in the folder. Raises RunFailedError, Interrupted, ...
 
-    Before it starts, a line on standard error says how much of the delay that the gains stand is left (`budget_line`).
+    Before it flies, a line on standard error says how much of the delay that the gains stand is left (`budget_line`).
     Whatever happens the folder keeps what was recorded, no process stays behind, and the summary is written if there is
     anything to sum up.
     """
     check_link(options.link)
-    scheme, _, address = options.link.partition("://")
     stop = StopFlag()
     stop.install()
-    budget = budget_line(scenario, options.clock)
-    if options.show_progress:
-        click.echo(f"{'warning: ' if budget.warn else ''}{budget.sentence}", err=True)
     placement = choose_placement(options.clock, realtime=options.realtime, spin_us=options.spin_us)
-    common = [
-        str(folder / FILES["scenario"]),
-        "--clock",
-        options.clock,
-        "--out",
-        str(folder),
-        "--wait",
-        str(options.wait_s),
-    ]
-    own = ["--speed", str(options.speed)] if options.speed else []
-    if options.delay_ns:
-        own += ["--delay", f"{options.delay_ns}ns"]
-    if options.motors:
-        own += options.motors.emulator_arguments
-    if options.legs:
-        common.append("--legs")
-    flight = ["--link", f"{scheme}://{address}", *own, "--on-log-error", options.on_log_error]
-    emulator = Child("plant_emulator", [*common, *placement.emulator, *flight])
-    # The controller learns its link when the emulator has opened its own: were the port another run's, it must not go there.
-    controller = Child(
-        "controller", [*common, *placement.controller, "--link", "-", "--arm", "--trigger", options.trigger]
-    )
+    emulator, controller = _start(folder, options, placement)
     keeper = None
     if options.motors and not options.motors.can.startswith("virtual:"):
-        keeper = MotorKeeper([common[0], "--can", options.motors.can, "--out", str(folder)])
+        keeper = MotorKeeper([str(folder / FILES["scenario"]), "--can", options.motors.can, "--out", str(folder)])
     try:
-        progress = Progress(scenario.duration_s) if options.show_progress else None
+        budget, progress = _while_they_get_ready(scenario, options)
         _watch(scenario, emulator, controller, keeper, stop, progress)
     finally:
         for child in (emulator, controller, *((keeper,) if keeper else ())):
             child.end()
+    from fwav_hil.report import summarise
+
     known = msgspec.to_builtins(budget)
     summary = summarise(folder, placement=placement.text, budget=known) if _has_rows(folder) else {}
     if stop.requested:
@@ -204,6 +131,40 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
                 child.failure, child.process.returncode if child.process.returncode > 0 else PeerError.exit_code
             )
     return summary
+
+
+def _start(folder: Path, options: RunOptions, placement: Placement) -> tuple[Child, Child]:
+    """Start both processes. The controller learns its link when the emulator has opened its own.
+
+    Were the port another run's, it must not go there.
+    """
+    common = [str(folder / FILES["scenario"]), "--clock", options.clock, "--out", str(folder)]
+    common += ["--wait", str(options.wait_s), *(("--legs",) if options.legs else ())]
+    flight = ["--link", options.link, "--on-log-error", options.on_log_error]
+    if options.speed:
+        flight += ["--speed", str(options.speed)]
+    if options.delay_ns:
+        flight += ["--delay", f"{options.delay_ns}ns"]
+    if options.motors:
+        flight += options.motors.emulator_arguments
+    answers = ["--link", "-", "--arm", "--trigger", options.trigger]
+    return (
+        Child("plant_emulator", [*common, *placement.emulator, *flight]),
+        Child("controller", [*common, *placement.controller, *answers]),
+    )
+
+
+def _while_they_get_ready(scenario: Scenario, options: RunOptions) -> tuple[Budget, Progress | None]:
+    """Work out the delay budget and, unless that is the caller's, show it and make the progress bar."""
+    from fwav_hil.studies.margin import budget_line
+
+    budget = budget_line(scenario, options.clock)
+    if not options.show_progress:
+        return budget, None
+    from fwav_hil.progress import Progress
+
+    click.echo(f"{'warning: ' if budget.warn else ''}{budget.sentence}", err=True)
+    return budget, Progress(scenario.duration_s)
 
 
 def _watch(
@@ -249,6 +210,8 @@ def _watch(
 
 def _error_now(scenario: Scenario, t_ns: int, q: list[float]) -> tuple[float, float]:
     """Largest position error (m) and attitude error (rad) at one time."""
+    import numpy as np
+
     from controller.reference import evaluate_reference, reference_parameters
 
     desired = np.empty((3, 6))
@@ -264,5 +227,7 @@ def _culprit_first(emulator: Child, controller: Child) -> tuple[Child, Child]:
 
 
 def _has_rows(folder: Path) -> bool:
+    import numpy as np
+
     path = folder / FILES["ground_truth"]
     return path.exists() and len(np.load(path, mmap_mode="r")) > 0

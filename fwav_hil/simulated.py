@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from bridge.clock import MonotonicClock
 from bridge.summary import write_json
-from fwav_hil.report import FILES, head
+from fwav_hil.report import head
+from fwav_hil.run_folder import FILES
 from fwav_hil.score import scores
 from fwav_hil.simulate import Simulation, simulate
 from plant_emulator.truth import ROW

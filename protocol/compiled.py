@@ -1,81 +1,42 @@
-"""Compiled kernels (numba) and the cache they are kept in.
-
-numba notices that a kernel's own file changed, but not that a kernel it calls in another file did. The cache folder is
-therefore named after a digest of every source file of the project and of the compiler's versions: a change anywhere
-gives a new, empty folder, so neither a developer nor an upgrade ever runs a stale kernel.
-"""
+"""Compiled kernels (numba), and the packed arguments that they take."""
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import hashlib
-import os
-import shutil
-import tempfile
+import importlib
+import sys
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, cast
 
 import numba
 import numpy as np
 import numpy.typing as npt
-import platformdirs
+
+from protocol.kernel_cache import cache_folder
 
 Packed: TypeAlias = npt.NDArray[np.void]
 """A structured array of shape (1,), as `pack` makes them."""
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
-PACKAGES = ("protocol", "bridge", "controller", "plant_emulator", "fwav_hil")
-_KEPT_FOLDERS = 4
 
+def _load_numpy_support() -> None:
+    """Load numba's support of NumPy, which it needs for every kernel, without SciPy's linear algebra.
 
-@functools.cache
-def cache_folder() -> Path:
-    """Folder of the compiled kernels of exactly these sources; created on first use.
-
-    Where the user's cache place cannot be written, a folder under the system's temporary place is used instead.
+    It would be imported only to see whether there is a BLAS, for `np.convolve` in kernels: a third of a second at every
+    start. No kernel here has one.
     """
-    digest = hashlib.sha256(f"{numba.__version__} {np.__version__}".encode())
-    root = Path(__file__).resolve().parent.parent
-    for package in PACKAGES:
-        for source in sorted((root / package).rglob("*.py")):
-            digest.update(source.relative_to(root).as_posix().encode())
-            digest.update(source.read_bytes())
-    name = digest.hexdigest()[:16]
-    for place in (
-        Path(platformdirs.user_cache_dir("fwav-hil")),
-        Path(tempfile.gettempdir()) / f"fwav-hil-{os.getuid()}",
-    ):
-        folder = place / "kernels" / name
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            os.utime(folder)
-        except OSError:
-            continue
-        if os.access(folder, os.W_OK):
-            _forget_old(folder)
-            return folder
-    return Path(tempfile.mkdtemp(prefix="fwav-hil-"))
+    name = "scipy.linalg.cython_blas"
+    if name in sys.modules or "numba.np.arraymath" in sys.modules:
+        return
+    sys.modules[name] = None  # type: ignore[assignment]  # this is how importing it is made to fail
+    try:
+        importlib.import_module("numba.np.arraymath")
+    finally:
+        del sys.modules[name]
 
 
-def _forget_old(folder: Path) -> None:
-    """Remove the folders of older sources, keeping the few used last (several checkouts may be in use)."""
-    with contextlib.suppress(OSError):  # the process at the other end may be tidying up at the same time
-        others = sorted((f for f in folder.parent.iterdir() if f != folder), key=lambda f: f.stat().st_mtime)
-        for old in others[: -(_KEPT_FOLDERS - 1)]:
-            shutil.rmtree(old, ignore_errors=True)
-
-
-def kernels_are_warm() -> bool:
-    """Whether a process has compiled every kernel into the cache of these sources (see `mark_warm`)."""
-    return (cache_folder() / "warm").exists()
-
-
-def mark_warm() -> None:
-    """Record that every kernel has been compiled, so that the next start need not look."""
-    (cache_folder() / "warm").touch()
+_load_numpy_support()
 
 
 def compiled(function: Kernel) -> Kernel:

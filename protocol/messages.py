@@ -6,16 +6,18 @@ roll, pitch, yaw (rad); generalised forces are body forces (N), then body torque
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import msgspec
-import numpy as np
-import numpy.typing as npt
+
+if TYPE_CHECKING:  # `--help` needs this module, and is there before numpy would be
+    import numpy as np
+    import numpy.typing as npt
 
 AXES = ("x", "y", "z", "alpha", "beta", "gamma")
 AXIS_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 
-FloatArray: TypeAlias = npt.NDArray[np.float64]
+FloatArray: TypeAlias = "npt.NDArray[np.float64]"
 
 
 class PositionSample(msgspec.Struct, frozen=True, gc=False):

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
-import numpy as np
 import tomli_w
 from msgspec import Meta
 
@@ -306,6 +305,8 @@ class Scenario(_Table, frozen=True):
     def initial_motion(self) -> FloatArray:
         """(12,) position, attitude, velocity, attitude rate at t = 0."""
         start = self.initial
+        import numpy as np  # here: see `protocol.messages`
+
         return np.array((*start.position, *start.attitude, *start.velocity, *start.attitude_rate))
 
     def digest(self) -> bytes:

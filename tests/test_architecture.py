@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from protocol.compiled import PACKAGES
+from protocol.kernel_cache import PACKAGES
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = [source for package in PACKAGES for source in sorted((ROOT / package).rglob("*.py"))]

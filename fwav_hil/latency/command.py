@@ -95,14 +95,13 @@ def latency(
         return
     chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
     from bridge.process import StopFlag
-    from controller.laws import make_law
+    from controller.laws import refuse_on_a_link
     from fwav_hil.compile import compile_kernels
     from fwav_hil.latency.study import LONGEST_PROBING_S, beside, closed_loop
-    from fwav_hil.run import check_link, new_folder
+    from fwav_hil.run import check_link
+    from fwav_hil.run_folder import new_folder
 
-    chosen_law = make_law(chosen.law, chosen)
-    if chosen_law.needs_velocity:
-        raise UsageError(chosen_law.velocity_sentence())
+    refuse_on_a_link(chosen)
     check_link(link)
     compile_kernels(chosen)
     folder = new_folder(chosen, out)
@@ -142,7 +141,7 @@ def _report(
     from fwav_hil.latency.figures import draw
     from fwav_hil.latency.study import report_of, summary_of, write_files
     from fwav_hil.latency.tables import print_report
-    from fwav_hil.report import FILES
+    from fwav_hil.run_folder import FILES
     from protocol.scenario import load_scenario
 
     legs = join_legs(folder, controller_folder)

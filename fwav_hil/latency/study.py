@@ -15,8 +15,9 @@ from bridge.summary import read_json
 from fwav_hil.latency.analysis import LEGS, Legs, clock_check
 from fwav_hil.latency.histogram import percentiles, write_hgrm
 from fwav_hil.latency.peers import cyclictest, probe_echo, probe_mavutil, probe_responder
-from fwav_hil.report import FILES, summarise
+from fwav_hil.report import summarise
 from fwav_hil.run import RunOptions, run
+from fwav_hil.run_folder import FILES
 from fwav_hil.score import scores
 from fwav_hil.simulate import Simulation, simulate
 from protocol.scenario import NANOSECONDS, Delay, Scenario

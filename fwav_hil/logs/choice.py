@@ -11,8 +11,8 @@ from pathlib import Path
 import click
 
 from fwav_hil.logs.working import Working
-from protocol.compiled import cache_folder
 from protocol.errors import UsageError
+from protocol.kernel_cache import cache_folder
 from protocol.log_files import Log, Sender, open_log
 
 _DAY_US = 86_400_000_000

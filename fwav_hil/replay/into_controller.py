@@ -11,14 +11,14 @@ import numpy as np
 from bridge.endpoint import VEHICLE, Endpoint
 from bridge.link import Link, open_link
 from bridge.process import StopFlag
-from controller.laws import make_law
+from controller.laws import make_law, refuse_on_a_link
 from fwav_hil.replay.difference import Difference
 from fwav_hil.replay.other_end import other_end
 from fwav_hil.replay.recorded import Recorded, Tick
 from plant_emulator.pacing import RESEND_AFTER_S
 from plant_emulator.process import FAREWELLS, meet_controller
 from protocol import mavlink_map
-from protocol.errors import PeerLostError, UsageError
+from protocol.errors import PeerLostError
 from protocol.messages import ActuatorCommand
 
 _LINK = "udpin://127.0.0.1:0"
@@ -26,9 +26,8 @@ _LINK = "udpin://127.0.0.1:0"
 
 def replay_in_process(run: Recorded) -> Difference:
     """Step the law of the run's scenario over its samples, in this process. Raises UsageError for state feedback."""
+    refuse_on_a_link(run.scenario)
     law = make_law(run.scenario.law, run.scenario)
-    if law.needs_velocity:
-        raise UsageError(law.velocity_sentence())
     state, was_armed = law.start(), False
     answers: dict[int, bytes] = {}
     for tick in run.ticks:
@@ -50,9 +49,7 @@ def replay_into_process(run: Recorded, wait_s: float, stop: StopFlag) -> Differe
 
     Raises UsageError for state feedback, LinkError, PeerError and Interrupted.
     """
-    law = make_law(run.scenario.law, run.scenario)
-    if law.needs_velocity:
-        raise UsageError(law.velocity_sentence())
+    refuse_on_a_link(run.scenario)
     with tempfile.TemporaryDirectory(prefix="fwav-hil-replay-") as folder, open_link(_LINK) as link:
         scenario = Path(folder) / "scenario.toml"
         scenario.write_text(run.scenario.to_toml(), encoding="utf-8")

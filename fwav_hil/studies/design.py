@@ -20,7 +20,8 @@ import numpy as np
 from scipy.optimize import Bounds, OptimizeResult, differential_evolution
 
 from controller.law import Law
-from controller.laws import make_law
+from controller.laws import make_law, make_realisation
+from controller.realisation import Realisation
 from fwav_hil.score import SETTLED_S, tracking_error
 from fwav_hil.simulate import simulate
 from fwav_hil.studies.flight_check import judge_flight
@@ -89,13 +90,13 @@ def with_gains(scenario: Scenario, axes: Iterable[int], names: Iterable[str], va
     return msgspec.structs.replace(scenario, control=msgspec.structs.replace(scenario.control, **changed))
 
 
-def shortfall(scenario: Scenario, axes: Iterable[int], margin: float = MARGIN, law: Law | None = None) -> float:
+def shortfall(scenario: Scenario, axes: Iterable[int], margin: float = MARGIN, law: Realisation | None = None) -> float:
     """How far the loops of these axes are from their margins: the poles' excess over the unit circle, summed; 0: none.
 
     Looked at: gains from 1/margin to margin times at the delay, and delays from none to margin times. `law`: made before.
     """
     delay_s = scenario.delay_ns / NANOSECONDS
-    loops = list(channels_of(scenario, law or make_law(scenario.law, scenario)).values())
+    loops = list(channels_of(scenario, law or make_realisation(scenario.law, scenario)).values())
     seen: list[int] = []
     total = 0.0
     for axis in axes:
@@ -138,7 +139,7 @@ def cost(task: Task, logarithms: FloatArray) -> float:
     """The mean log RMSE of the group's axes; far higher where a flight is lost, higher still where margins are short."""
     candidate = with_gains(task.scenario, task.axes, task.names, np.exp(logarithms))
     law = make_law(candidate.law, candidate)  # no delay and no seed changes it
-    missing = shortfall(candidate, task.axes, _SPARE * MARGIN, law)
+    missing = shortfall(candidate, task.axes, _SPARE * MARGIN, law.realisation)
     if missing > 0.0:
         return _INFEASIBLE * (1.0 + min(missing, 100.0))
     if flown_error(at_twice_the_delay(candidate), task.seeds[:1], law)[1]:

@@ -12,22 +12,22 @@ complex (a describing function). tau is multiplied by b here, so a plant's gain 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import brentq
 
-from controller.law import ERROR, ERROR_RATE, POSITION, VELOCITY, Law
-from controller.laws import make_law
+from controller.laws import make_realisation
+from controller.realisation import ERROR, ERROR_RATE, POSITION, VELOCITY, Realisation
 from protocol.messages import AXES, FloatArray
 from protocol.scenario import NANOSECONDS, Scenario
 
 ComplexArray = npt.NDArray[np.complex128]
 
 _LOWEST_RAD_S = 1e-3
+_MOST_STEPS, _ROUNDING = 100, 1e-13
 _ENOUGH_SAMPLES = 600
 """A loop that stands more periods of delay than these is said to have no limit."""
 
@@ -135,6 +135,29 @@ class Channel:
         return complex(self.loop(delay_s, np.array([omega]))[0])
 
 
+def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    """Where the function is zero between two places of opposite sign: regula falsi, by the Illinois rule, to rounding.
+
+    As `scipy.optimize.brentq` finds it (a test holds that), without the half second that importing it adds to `run`.
+    """
+    at_low, at_high = function(low), function(high)
+    found, moved = low, 0
+    for _ in range(_MOST_STEPS):
+        before, found = found, (low * at_high - high * at_low) / (at_high - at_low)
+        at = function(found)
+        if at == 0.0 or abs(found - before) <= _ROUNDING * abs(found):
+            break
+        if (at > 0.0) == (at_high > 0.0):
+            high, at_high = found, at
+            at_low *= 0.5 if moved == 1 else 1.0
+            moved = 1
+        else:
+            low, at_low = found, at
+            at_high *= 0.5 if moved == -1 else 1.0
+            moved = -1
+    return float(found)
+
+
 def split_delay(delay_s: float, period: float) -> tuple[int, float]:
     """Whole periods of a delay, and the rest as a fraction of one."""
     samples = delay_s / period
@@ -153,12 +176,11 @@ def _held(period: float, fraction: float) -> tuple[FloatArray, FloatArray]:
 
 def channels(scenario: Scenario) -> dict[str, Channel]:
     """The linear loop of each axis, for the slope h of the gears. Raises UsageError for a law there is not."""
-    return channels_of(scenario, make_law(scenario.law, scenario))
+    return channels_of(scenario, make_realisation(scenario.law, scenario))
 
 
-def channels_of(scenario: Scenario, made: Law) -> dict[str, Channel]:
-    """The same for a law that has been made already."""
-    law = made.realisation
+def channels_of(scenario: Scenario, law: Realisation) -> dict[str, Channel]:
+    """The same for a law that has been realised already."""
     ratios = gain_ratios(scenario)
     loops = {}
     for i, axis in enumerate(AXES):
@@ -212,7 +234,7 @@ def _border_gains(channel: Channel, delay_s: float, turn: complex, *, nyquist: b
     for i in change:
         if i == len(omega) - 2 and nyquist:
             continue  # the imaginary part ends at zero there: rounding, and the border is taken below
-        crossing = brentq(lambda w: (turn * channel._loop_at(delay_s, w)).imag, omega[i], omega[i + 1], rtol=1e-12)
+        crossing = _root(lambda w: (turn * channel._loop_at(delay_s, w)).imag, omega[i], omega[i + 1])
         real = (turn * channel._loop_at(delay_s, crossing)).real
         if real < 0.0:
             yield -1.0 / real
@@ -235,9 +257,7 @@ def crossovers(channel: Channel, gain: complex, delay_s: float) -> list[tuple[fl
     omega, size = channel.frequencies, np.log(np.abs(gain * channel.loop(delay_s)))
     found = []
     for i in np.nonzero(np.sign(size[:-1]) * np.sign(size[1:]) < 0)[0]:
-        crossing = brentq(
-            lambda w: float(np.log(abs(gain * channel._loop_at(delay_s, w)))), omega[i], omega[i + 1], rtol=1e-12
-        )
+        crossing = _root(lambda w: float(np.log(abs(gain * channel._loop_at(delay_s, w)))), omega[i], omega[i + 1])
         found.append((crossing, float(np.angle(-gain * channel._loop_at(delay_s, crossing)))))
     return found
 

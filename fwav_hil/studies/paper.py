@@ -16,8 +16,8 @@ import msgspec
 import numpy as np
 
 from controller.laws import make_law
-from fwav_hil.report import FILES
-from fwav_hil.run import RunOptions, new_folder, run
+from fwav_hil.run import RunOptions, run
+from fwav_hil.run_folder import FILES, new_folder
 from fwav_hil.score import scores
 from fwav_hil.simulate import Simulation, simulate
 from plant_emulator.truth import load_truth

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
+import msgspec
 import pytest
 
-from controller.laws import LAWS, make_law
-from protocol.errors import UsageError
+from controller.laws import LAWS, make_law, refuse_on_a_link
+from protocol.errors import ScenarioError, UsageError
 from protocol.scenario import find_scenario, load_scenario
 from tests.contracts.law_contract import LawContract
 
@@ -55,3 +59,25 @@ def test_every_law_says_what_it_is() -> None:
     summaries = [entry.summary for entry in LAWS.values()]
     assert all(summaries)
     assert len(set(summaries)) == len(summaries)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_what_cannot_fly_on_a_link_is_refused_without_making_it(name: str) -> None:
+    scenario = msgspec.structs.replace(load_scenario(find_scenario("flapper")), law=name)
+    if LAWS[name].needs_velocity:
+        with pytest.raises(UsageError, match=f"'{name}' needs velocities, which the link does not carry"):
+            refuse_on_a_link(scenario)
+        return
+    refuse_on_a_link(scenario)
+    first = msgspec.structs.replace(scenario, control=msgspec.structs.replace(scenario.control, order=1))
+    with pytest.raises(ScenarioError) as early:
+        refuse_on_a_link(first)
+    with pytest.raises(ScenarioError) as late:
+        make_law(name, first)
+    assert str(early.value) == str(late.value)
+
+
+def test_the_registry_loads_no_law() -> None:
+    program = "import sys, controller.laws; print('numba' in sys.modules, 'numpy' in sys.modules)"
+    told = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
+    assert told == "False False\n"

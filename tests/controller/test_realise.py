@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 from scipy.signal import butter, lsim
 
-from controller.law import ERROR, POSITION, REFERENCE_ACCELERATION, VELOCITY, Realisation
-from controller.realise import Estimator, butterworth, estimator, realise
+from controller.realisation import ERROR, POSITION, REFERENCE_ACCELERATION, VELOCITY, Realisation
+from controller.realise import Estimator, butterworth, estimator, exponential, realise
 from protocol.errors import ScenarioError
 from protocol.messages import FloatArray
 from protocol.scenario import Scenario, find_scenario, load_scenario
@@ -214,3 +215,20 @@ def test_state_feedback_takes_the_rate_of_the_error_as_it_comes(flapper: Scenari
 @pytest.mark.parametrize("order", range(1, 9))
 def test_the_butterworth_polynomial_is_scipys_to_the_bit(order: int) -> None:
     assert butterworth(order).tolist() == butter(order, 1.0, analog=True)[1].tolist()
+
+
+@given(matrix=arrays(np.float64, st.integers(1, 7).map(lambda n: (n, n)), elements=st.floats(-4.0, 4.0)))
+def test_the_exponential_is_scipys(matrix: FloatArray) -> None:
+    """Both round: what is compared is the whole matrix."""
+    theirs = expm(matrix)
+    # Squaring leaves an error in proportion to the largest powers on the way.
+    assert exponential(matrix) == pytest.approx(theirs, rel=0.0, abs=1e-12 * np.exp(np.linalg.norm(matrix, 2)))
+
+
+def test_the_exponential_of_no_matrix_at_all_is_one() -> None:
+    assert exponential(np.zeros((3, 3))).tolist() == np.eye(3).tolist()
+
+
+def test_the_exponential_of_a_turn_turns() -> None:
+    turn = exponential(np.array([[0.0, -1.0], [1.0, 0.0]]) * math.pi / 6.0)
+    assert turn == pytest.approx(np.array([[math.sqrt(3.0), -1.0], [1.0, math.sqrt(3.0)]]) / 2.0, abs=1e-15)

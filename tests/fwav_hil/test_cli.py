@@ -140,7 +140,7 @@ class TestHelp:
 import sys
 from bridge.command_line import run_command
 from fwav_hil.cli import COMMANDS, cli
-slow = ["numba", "matplotlib", "pymavlink", "scipy", "rich"]
+slow = ["numpy", "numba", "matplotlib", "pymavlink", "scipy", "rich"]
 def loaded(): return [name for name in slow if name in sys.modules]
 at_import = loaded()
 codes = [run_command(cli, "fwav-hil", arguments) for arguments in (["--help"], *([name, "--help"] for name in COMMANDS))]

@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -144,19 +145,20 @@ def test_flapper_tracks_within_its_bounds(rate: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("quiet", [False, True])
-def test_a_budget_that_is_all_but_used_up_is_a_warning_before_anything_starts(
+def test_a_budget_that_is_all_but_used_up_is_a_warning_before_anything_flies(
     quiet: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    class NoProcessError(FwavHilError):
+    class NoFlightError(FwavHilError):
         pass
 
     def refuse(*_: object) -> None:
-        raise NoProcessError
+        raise NoFlightError
 
-    monkeypatch.setattr(fwav_hil.run, "Child", refuse)
+    monkeypatch.setattr(fwav_hil.run, "Child", Mock())
+    monkeypatch.setattr(fwav_hil.run, "_watch", refuse)
     monkeypatch.setattr("fwav_hil.run.StopFlag.install", lambda _: None)
     options = RunOptions(clock="realtime", show_progress=not quiet)
-    with pytest.raises(NoProcessError):
+    with pytest.raises(NoFlightError):
         fwav_hil.run.run(scenario_of("paper", rate_hz=200.0), tmp_path, options)
     told = capsys.readouterr().err
     assert ("warning: delay budget (ude, 200 Hz): the gains stand 3.38 ms" in told) != quiet

@@ -1,17 +1,12 @@
-"""The cache of compiled kernels, on small trees of sources: a change anywhere gives another folder."""
+"""Kernels and their packed arguments."""
 
 from __future__ import annotations
 
 import importlib
-import importlib.util
-import itertools
-import os
-import shutil
+import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any, ClassVar
 
 import numba
@@ -19,165 +14,9 @@ import numpy as np
 import pytest
 
 from protocol import compiled as ours
+from tests.protocol.source_tree import load_compiled as load
 
 NUMBA_CONFIG: Any = numba.config
-_numbers = itertools.count()
-DIGEST_LENGTH = 16
-
-
-@pytest.fixture
-def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The user's cache and the system's temporary place, both within tmp_path."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    (tmp_path / "temporary").mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
-    return tmp_path
-
-
-@pytest.fixture
-def tree(places: Path) -> Path:
-    """A project with one source in each package, and a copy of the module under test."""
-    root = places / "tree"
-    for package in ours.PACKAGES:
-        (root / package / "deep").mkdir(parents=True)
-        (root / package / "__init__.py").touch()
-        (root / package / "deep" / "kernel.py").write_text("ANSWER = 41\n")
-    shutil.copy(str(ours.__file__), root / "protocol" / "compiled.py")
-    return root
-
-
-def load(tree: Path) -> Any:
-    """The module of that tree, as a new process would have it."""
-    name = f"compiled_copy_{next(_numbers)}"
-    spec = importlib.util.spec_from_file_location(name, tree / "protocol" / "compiled.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module: ModuleType = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-class TestFolder:
-    def test_equal_sources_share_a_folder_in_the_users_cache(self, tree: Path, places: Path) -> None:
-        folder = load(tree).cache_folder()
-        assert folder.is_dir()
-        assert folder.is_relative_to(places / "cache" / "fwav-hil")
-        assert len(folder.name) == DIGEST_LENGTH
-        for source in tree.rglob("*.py"):
-            os.utime(source, (1, 1))  # a fresh checkout: other times, same bytes
-        assert load(tree).cache_folder() == folder
-
-    def test_the_place_of_the_tree_does_not_matter(self, tree: Path, places: Path) -> None:
-        folder = load(tree).cache_folder()
-        shutil.copytree(tree, places / "elsewhere")
-        assert load(places / "elsewhere").cache_folder() == folder
-
-    @pytest.mark.parametrize("package", ours.PACKAGES)
-    def test_a_change_in_any_package_gives_another_folder(self, tree: Path, package: str) -> None:
-        before = load(tree).cache_folder()
-        (tree / package / "deep" / "kernel.py").write_text("ANSWER = 42\n")
-        after = load(tree).cache_folder()
-        assert after != before
-        assert not list(after.iterdir())
-        (tree / package / "deep" / "kernel.py").write_text("ANSWER = 41\n")
-        assert load(tree).cache_folder() == before
-
-    def test_a_source_that_comes_goes_or_moves_gives_another_folder(self, tree: Path) -> None:
-        deep = tree / "controller" / "deep"
-        folders = [load(tree).cache_folder()]
-        (deep / "more.py").touch()
-        folders.append(load(tree).cache_folder())
-        (deep / "more.py").rename(deep / "other.py")
-        folders.append(load(tree).cache_folder())
-        (deep / "kernel.py").unlink()
-        folders.append(load(tree).cache_folder())
-        assert len(set(folders)) == len(folders)
-
-    @pytest.mark.parametrize("library", ["numba", "np"])
-    def test_another_compiler_gives_another_folder(
-        self, tree: Path, library: str, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        before = load(tree).cache_folder()
-        module = load(tree)
-        monkeypatch.setattr(getattr(module, library), "__version__", "0.0.0")
-        assert module.cache_folder() != before
-
-    def test_all_packages_of_the_project_count(self) -> None:
-        root = Path(str(ours.__file__)).parents[1]
-        with_kernels = {
-            source.relative_to(root).parts[0]
-            for source in root.glob("[a-z]*/**/*.py")
-            if "@compiled" in source.read_text(encoding="utf-8")
-        } - {"tests", "benchmarks"}
-        assert "protocol" in with_kernels
-        assert with_kernels <= set(ours.PACKAGES)
-
-
-class TestFallback:
-    # A file where a folder must be: that stops root, too, under whom tests may run.
-    def test_where_the_users_cache_cannot_be_written_the_temporary_place_serves(self, tree: Path, places: Path) -> None:
-        (places / "cache").write_text("in the way")
-        folder = load(tree).cache_folder()
-        assert folder.is_dir()
-        assert folder.is_relative_to(places / "temporary" / f"fwav-hil-{os.getuid()}")
-        assert load(tree).cache_folder() == folder
-
-    def test_a_cache_that_may_be_read_only_is_passed_over(
-        self, tree: Path, places: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def allows(path: Path, mode: int) -> bool:
-            return not (mode & os.W_OK and path.is_relative_to(places / "cache"))
-
-        monkeypatch.setattr(os, "access", allows)
-        assert load(tree).cache_folder().is_relative_to(places / "temporary")
-
-    def test_where_nothing_lasts_a_folder_of_its_own_serves(self, tree: Path, places: Path) -> None:
-        (places / "cache").write_text("in the way")
-        (places / "temporary" / f"fwav-hil-{os.getuid()}").write_text("in the way")
-        module = load(tree)
-        folder = module.cache_folder()
-        assert folder.is_dir()
-        assert folder.is_relative_to(places / "temporary")
-        assert module.cache_folder() == folder
-        assert load(tree).cache_folder() != folder
-
-
-class TestTidying:
-    def test_the_folders_used_last_are_kept_and_the_older_ones_go(self, tree: Path) -> None:
-        kernels = load(tree).cache_folder().parent
-        for age in range(1, 8):
-            old = kernels / f"used-{age}-days-ago"
-            old.mkdir()
-            (old / "kernel.nbi").touch()
-            os.utime(old, (10**9 - 86400 * age,) * 2)
-        current = load(tree).cache_folder()
-        assert {folder.name for folder in kernels.iterdir()} == {
-            current.name,
-            "used-1-days-ago",
-            "used-2-days-ago",
-            "used-3-days-ago",
-        }
-
-    def test_using_a_folder_makes_it_young_again(self, tree: Path) -> None:
-        folder = load(tree).cache_folder()
-        os.utime(folder, (1, 1))
-        assert load(tree).cache_folder() == folder
-        assert folder.stat().st_mtime > 10**9
-
-    def test_a_folder_that_vanishes_meanwhile_is_no_error(self, tree: Path) -> None:
-        # The process at the other end starts at the same moment and tidies up as well: what was listed is not there.
-        folder = load(tree).cache_folder()
-        (folder.parent / "gone").symlink_to(folder.parent / "nowhere")
-        assert load(tree).cache_folder() == folder
-
-    def test_warmth_belongs_to_the_folder(self, tree: Path) -> None:
-        module = load(tree)
-        assert not module.kernels_are_warm()
-        module.mark_warm()
-        assert module.kernels_are_warm()
-        assert load(tree).kernels_are_warm()
-        (tree / "bridge" / "deep" / "kernel.py").write_text("ANSWER = 42\n")
-        assert not load(tree).kernels_are_warm()
 
 
 @pytest.fixture
@@ -284,3 +123,25 @@ from inner_kernel import inner
 def outer(value: float) -> float:
     return inner(value) + 2.0
 """
+
+
+def test_kernels_need_no_linear_algebra_of_scipy(tmp_path: Path) -> None:
+    """Which would be a third of a second at every start; a program's own kernels still get it where they ask for it."""
+    (tmp_path / "program.py").write_text("""
+import sys
+from protocol.compiled import compiled
+
+@compiled
+def total(values):
+    return values.sum()
+
+import numpy as np
+print(total(np.ones(3)), "scipy.linalg" in sys.modules)
+import scipy.linalg.cython_blas
+import numba
+print(numba.njit(lambda a: np.dot(a, a))(np.ones((2, 2)))[0, 0])
+""")
+    told = subprocess.run(
+        [sys.executable, str(tmp_path / "program.py")], check=True, capture_output=True, text=True
+    ).stdout.split()
+    assert told == ["3.0", "False", "2.0"]

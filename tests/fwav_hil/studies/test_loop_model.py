@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import math
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import brentq
 
 from fwav_hil.simulate import simulate
 from fwav_hil.studies.loop_model import (
     Channel,
+    _root,
     channels,
     crossovers,
     gain_ratios,
@@ -214,3 +221,31 @@ def test_a_complex_gain_of_modulus_one_keeps_only_positive_frequencies() -> None
 def test_an_unknown_law_is_refused() -> None:
     with pytest.raises(UsageError, match="there is no law 'lqr'"):
         channels(scenario_of("flapper", law="lqr"))
+
+
+@given(
+    zero=st.floats(0.01, 99.0),
+    power=st.integers(1, 3),
+    bend=st.floats(-0.9, 5.0),
+    rising=st.booleans(),
+)
+def test_a_root_is_where_brentq_finds_it(zero: float, power: int, bend: float, rising: bool) -> None:
+    sign = 1.0 if rising else -1.0
+
+    def function(w: float) -> float:
+        return sign * (math.log(w / zero) + max(0.0, bend) * ((w / zero) ** power - 1.0))
+
+    assert _root(function, 0.005, 100.0) == pytest.approx(brentq(function, 0.005, 100.0, xtol=1e-15), rel=1e-9)
+
+
+def test_the_budget_of_a_run_loads_neither_kernels_nor_optimisers() -> None:
+    """It is worked out while the two processes get ready, on the cores that they need."""
+    program = """
+import sys
+from fwav_hil.studies.margin import budget_line
+from protocol.scenario import find_scenario, load_scenario
+budget_line(load_scenario(find_scenario("flapper")))
+print("numba" in sys.modules, "scipy.optimize" in sys.modules)
+"""
+    told = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
+    assert told == "False False\n"
