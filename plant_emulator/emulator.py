@@ -84,9 +84,9 @@ class Emulator:
             self._record(t_ns)
             raise
 
-    def settle(self, t_ns: int) -> None:
-        """What is left to do after `go_on`, while the next tick is on its way."""
-        self._quick.settle(t_ns)
+    def settle(self, t_ns: int, arrival_ns: int) -> None:
+        """What is left to do after `go_on`, while the next tick is on its way; the answer came at arrival_ns."""
+        self._quick.settle(arrival_ns)
         self._record(t_ns)
 
     def _record(self, t_ns: int) -> None:

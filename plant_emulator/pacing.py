@@ -25,6 +25,9 @@ from protocol.tlog import TlogWriter
 RESEND_AFTER_S = (0.010, 0.020, 0.040, 0.080, 0.160, 0.320, 0.640, 0.730)
 """Waits of the exact profile: after each the tick is sent again; after the last, 2 s in all, the run ends."""
 
+_LOG_PERIOD_NS = 5_000_000
+"""How often the log of a real-time run is handed over: what a kill -9 may cost."""
+
 
 class Parts(NamedTuple):
     """What a pacing brings together, whichever it is; period_ns: from tick to tick."""
@@ -59,6 +62,10 @@ class Pacing(abc.ABC):
         Raises PeerLostError where the controller fell silent, Interrupted where the user asked to stop, DivergenceError
         where the plant cannot go on; the tick's row is then recorded.
         """
+
+    def all_counters(self) -> dict[str, int]:
+        """Everything counted, by name, that of the schedule too."""
+        return {**self.counters, **(self.keeper.counters if self.keeper else {})}
 
     def owe_log(self, t_us: int, frames: Sequence[bytes]) -> None:
         """Have frames logged under one time, at the next `settle_log`."""
@@ -139,7 +146,6 @@ class Lockstep(Pacing):
                 self._keeper.start()
             self._keeper.sleep()
             self._keeper.tick()
-            self.counters.update(self._keeper.counters)
 
     def _send(self, datagram: bytes) -> None:
         self._sent_ns = self.clock.now_ns()
@@ -192,7 +198,7 @@ class Lockstep(Pacing):
         self.latencies_ns.append(answered_ns - self._sent_ns)
         self._send(datagram)
         self._is_sent = True
-        self.emulator.settle(t_ns)
+        self.emulator.settle(t_ns, t_ns)
         self.owe_log(t_ns // 1000, [data])
         self.owe_log(end_ns // 1000, (datagram[:middle], datagram[middle:]))
         return True
@@ -213,6 +219,10 @@ class RealTime(Pacing):
     Late ticks are counted and never caught up in a burst: where the machine misses whole periods, simulation time lags
     wall time by as many (`slipped`).
 
+    sleeps_through   the plant moves at the end of a period only, so where the link stamps what it receives (`Link.received_ns`)
+                     the period is slept through, and what came is taken at its end, each at the time of its stamp. Else each
+                     command wakes the process, and came when it woke.
+
     counters   late, slipped    of the schedule (`RateKeeper`)
                unanswered       ticks whose command had not come when the next one was due
                old_commands     commands older than one that came before, dropped
@@ -226,23 +236,24 @@ class RealTime(Pacing):
         self,
         parts: Parts,
         *,
+        ticks: int,
         spin_ns: int = 0,
+        sleeps_through: bool = False,
     ) -> None:
         super().__init__(parts)
         self._keeper = self.keeper = RateKeeper(self.clock, self.period_ns, spin_ns)
+        self._sleeps_through = sleeps_through
+        self._ahead_until_ns = ticks * self.period_ns if self.emulator.safety.outlasts(self.period_ns) else 0
+        """Ticks before this time may be sent together with the taking of a plain answer to the one before them."""
+        self._log_every = max(1, _LOG_PERIOD_NS // self.period_ns)
+        self._is_sent = False
         self._sent: dict[int, int] = {}
         self._newest_ns = -1
         self._begun = False
         self.time_sync = TimeSync(self.endpoint, self.clock)
         self.legs: tuple[LegTable, LegTable] | None = None
         self._heard_ns = self._due_ns = self.clock.now_ns()
-        self.counters = {
-            **self._keeper.counters,
-            "unanswered": 0,
-            "old_commands": 0,
-            "repeated": 0,
-            "unknown_echoes": 0,
-        }
+        self.counters = {"unanswered": 0, "old_commands": 0, "repeated": 0, "unknown_echoes": 0}
 
     def exchange(self, tick: int, t_ns: int) -> None:
         """Send the tick, then take commands until the next one is due."""
@@ -250,26 +261,38 @@ class RealTime(Pacing):
         if tick == 0:
             self._keeper.start()
             self._heard_ns = self._due_ns = self.clock.now_ns()
-        woke_ns = self.clock.now_ns()
-        frames = self.emulator.sense(t_ns)
-        begun_ns = self.clock.now_ns()
-        self.endpoint.send(frames)
-        self.owe_log(unix_time_us(), frames)
-        self.settle_log()
-        self._sent[t_ns] = begun_ns
-        if self.legs:
-            self.legs[0].add(t_ns, self._due_ns, woke_ns, begun_ns)
+        if not self._is_sent:
+            woke_ns = self.clock.now_ns()
+            frames = self.emulator.sense(t_ns)
+            self._send(t_ns, b"".join(frames))
+            self.owe_log(unix_time_us(), frames)
+            if self.legs:
+                self.legs[0].add(t_ns, self._due_ns, woke_ns, self._sent[t_ns])
+        self._is_sent = False
+        if tick % self._log_every == 0:
+            self.settle_log()
+        begun_ns = self._sent[t_ns]
         if begun_ns >= self.time_sync.next_ns:
             self._say(self.time_sync.question())
         self._due_ns = self._keeper.deadline_ns
-        while (wait_s := self._keeper.remaining_s()) is not None:
-            received = self.endpoint.receive(wait_s)
-            arrived_ns = self.clock.now_ns()
-            for frame in received:
-                since_tick_ns = min(max(0, arrived_ns - begun_ns), self.period_ns)
-                self._take(frame, t_ns + since_tick_ns, arrived_ns)
-        self._keeper.tick()
-        self.counters.update(self._keeper.counters)
+        if self._sleeps_through:
+            self._keeper.sleep()
+            self._keeper.tick()
+            link = self.endpoint.link
+            while data := link.recv(0.0):
+                stamp_ns = link.received_ns or self.clock.now_ns()
+                if self._go_on(t_ns, begun_ns, stamp_ns, data):
+                    return  # more may have come, but hardly ever has: it waits for the next tick's turn, with its stamp
+                for frame in self.endpoint.reader.read(data):
+                    self._take(frame, t_ns + self._since(begun_ns, stamp_ns), stamp_ns, stamp_ns)
+        else:
+            while (wait_s := self._keeper.remaining_s()) is not None:
+                received = self.endpoint.receive(wait_s)
+                arrived_ns = self.clock.now_ns()
+                for frame in received:
+                    stamp_ns = self.endpoint.link.received_ns
+                    self._take(frame, t_ns + self._since(begun_ns, arrived_ns), arrived_ns, stamp_ns)
+            self._keeper.tick()
         if self._newest_ns < t_ns:
             self.counters["unanswered"] += 1
         self.emulator.check_staleness(t_ns + self.period_ns)
@@ -280,13 +303,57 @@ class RealTime(Pacing):
             )
         self.emulator.advance(t_ns + self.period_ns)
 
-    def _take(self, frame: Frame, arrival_ns: int, wall_ns: int) -> None:
-        self.owe_log(unix_time_us(), [frame.raw])
+    def _since(self, begun_ns: int, moment_ns: int) -> int:
+        """How far into its period, begun at begun_ns, a moment of wall time lies."""
+        return min(max(0, moment_ns - begun_ns), self.period_ns)
+
+    def _send(self, t_ns: int, datagram: bytes) -> None:
+        self._sent[t_ns] = self.clock.now_ns()
+        self.endpoint.link.send(datagram)
+
+    def _unix_us(self, moment_ns: int) -> int:
+        """The time for the log of a moment that has just passed."""
+        return unix_time_us() - (self.clock.now_ns() - moment_ns) // 1000
+
+    def _go_on(self, t_ns: int, begun_ns: int, stamp_ns: int, data: bytes) -> bool:
+        """Take a plain answer to the tick, move the plant, and send the next tick, which is plain too: all else waits."""
+        end_ns = t_ns + self.period_ns
+        if end_ns >= self._ahead_until_ns or not self._begun or self._newest_ns == t_ns:
+            return False
+        since_ns = self._since(begun_ns, stamp_ns)
+        try:
+            following = self.emulator.go_on(data, t_ns, end_ns, since_ns)
+        except DivergenceError:
+            self.owe_log(unix_time_us(), [data])
+            raise
+        if following is None:
+            return False
+        datagram, middle = following
+        self._send(end_ns, datagram)
+        self._is_sent = True
+        self.emulator.settle(t_ns, t_ns + since_ns)
+        self.owe_log(self._unix_us(stamp_ns), [data])
+        self.owe_log(unix_time_us(), (datagram[:middle], datagram[middle:]))
+        self._answered(t_ns, stamp_ns)
+        return True
+
+    def _answered(self, t_ns: int, arrived_ns: int) -> None:
+        """Take note of the newest command: that for the tick of t_ns."""
+        self._newest_ns = t_ns
+        self._heard_ns = arrived_ns
+        sent_ns = self._sent.pop(t_ns)
+        self.latencies_ns.append(arrived_ns - sent_ns)
+        if len(self._sent) > 1:  # ticks that will not be answered any more
+            self._sent = {later_ns: sent_ns for later_ns, sent_ns in self._sent.items() if later_ns > t_ns}
+
+    def _take(self, frame: Frame, arrival_ns: int, wall_ns: int, stamp_ns: int) -> None:
+        """Take a frame that came at simulation time arrival_ns, wall_ns of this machine, and was stamped then (0: not)."""
+        self.owe_log(self._unix_us(wall_ns), [frame.raw])
         if (frame.system, frame.component) != VEHICLE:
             return
         self._heard_ns = wall_ns
         if frame.message_id == mavlink_map.TIMESYNC.message_id:
-            answer = self.time_sync.take(frame, self.endpoint.link.received_ns or wall_ns)
+            answer = self.time_sync.take(frame, stamp_ns or wall_ns)
             if answer:
                 self._say(answer)
             return
@@ -304,17 +371,14 @@ class RealTime(Pacing):
         if command.t_ns == self._newest_ns:
             self.counters["repeated"] += 1
             return
-        sent_ns = self._sent.get(command.t_ns)
-        if sent_ns is None:
+        if command.t_ns not in self._sent:
             self.counters["unknown_echoes"] += 1
             return
-        self._newest_ns = command.t_ns
-        self.latencies_ns.append(wall_ns - sent_ns)
-        self._sent = {t_ns: sent for t_ns, sent in self._sent.items() if t_ns > command.t_ns}
+        self._answered(command.t_ns, wall_ns)
         self.emulator.act(arrival_ns, 0, command)
         if self.legs:
             applied_ns = self.clock.now_ns()
-            self.legs[1].add(command.t_ns, self.endpoint.link.received_ns, wall_ns, applied_ns, arrival_ns)
+            self.legs[1].add(command.t_ns, stamp_ns, wall_ns, applied_ns, arrival_ns)
 
     def _say(self, frame: bytes) -> None:
         self.endpoint.send([frame])

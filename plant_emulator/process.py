@@ -192,7 +192,10 @@ def _motors(
 def _pacing(scenario: Scenario, options: EmulatorOptions, parts: Parts, settings: Settings) -> Pacing:
     if options.clock == "realtime":
         spin_ns = choose_spin_ns(parts.clock, scenario.period_ns, options.spin_s, measure=has_own_core(settings))
-        return RealTime(parts, spin_ns=spin_ns)
+        # Drives on a bus are told at once; the legs are measured, and a delay made, by whoever wakes for each command.
+        wakes = options.legs or options.delay_ns or options.motors
+        through = not wakes and parts.endpoint.link.stamp_receives()
+        return RealTime(parts, ticks=scenario.ticks, spin_ns=spin_ns, sleeps_through=through)
     keeper = RateKeeper(parts.clock, round(scenario.period_ns / options.speed)) if options.speed else None
     return Lockstep(parts, ticks=scenario.ticks, delay_ns=scenario.delay_ns, keeper=keeper)
 
@@ -266,7 +269,7 @@ def _run_ticks(
     wall_ns = clock.now_ns() - begun_ns
     processor_ns = processor_time_ns() - processor_ns
     _say_farewell(emulator, pacing, done * period_ns)
-    counters = {**emulator.all_counters(), **pacing.counters}
+    counters = {**emulator.all_counters(), **pacing.all_counters()}
     summary = {
         "clock": "realtime" if isinstance(pacing, RealTime) else "lockstep",
         "ticks": done,

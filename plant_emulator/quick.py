@@ -132,8 +132,8 @@ class QuickTicks:
         self._plant.arrive(end_ns, outcome)
         return self._frames.taken(end), middle
 
-    def settle(self, t_ns: int) -> None:
-        """Take note of the answer that `go_on` took, and make ready for the next."""
+    def settle(self, arrival_ns: int) -> None:
+        """Take note of the answer that `go_on` took and when it came, and make ready for the next."""
         self._reader.expect(VEHICLE, self._sequence + 1)
-        self._safety.accepted(t_ns, self._excess[0])
+        self._safety.accepted(arrival_ns, self._excess[0])
         self._normal = self._position.next_normal()

@@ -59,6 +59,10 @@ class SafetyEnvelope:
         if excess > _TOLERANCE:
             self.counters["clamped"] += 1
 
+    def outlasts(self, period_ns: int) -> bool:
+        """Whether no command grows stale within a period after it came."""
+        return self._staleness_ns >= period_ns
+
     def stale_output(self, t_ns: int) -> tuple[int, FloatArray] | None:
         """(time it begins to act, safe tau) once per outage, where the last command is too old at t_ns; else None."""
         if self._last_ns is None or t_ns - self._last_ns <= self._staleness_ns:

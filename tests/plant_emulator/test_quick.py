@@ -75,7 +75,7 @@ def test_the_short_way_makes_the_same_frames_rows_and_counters_as_the_long_one(t
             assert long_way(quick, data, t_ns) == long_way(slow, data, t_ns)
             continue
         quick_ticks += 1
-        quick.emulator.settle(t_ns)
+        quick.emulator.settle(t_ns, t_ns)
         datagram, middle = following
         assert [datagram[:middle], datagram[middle:]] == long_way(slow, data, t_ns)
         assert quick.emulator.plant.t_ns == slow.emulator.plant.t_ns
