@@ -47,7 +47,7 @@ def main() -> None:
     """Run all, print and write."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Benchmarks; without names, all of them.")
     parser.add_argument("names", nargs="*", choices=[*BENCHMARKS, []], metavar="NAME", help=", ".join(BENCHMARKS))
-    parser.add_argument("--wake-up-seconds", type=float, default=10.0, help="length of a turn of wake_up (default 10)")
+    parser.add_argument("--wake-up-seconds", type=float, default=60.0, help="length of a turn of wake_up (default 60)")
     parser.add_argument(
         "--rotorpy-python", default=sys.executable, help="a Python that has RotorPy (default: this one)"
     )

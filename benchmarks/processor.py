@@ -29,8 +29,8 @@ def processor_time() -> dict[str, dict[str, Any]]:
                 shares[end][how] = min(shares[end].get(how, 1.0), share)
     return {
         f"processor_{end}": row(
-            share["asleep"], "of a core", "bare 1 kHz loop", bare, f"<= {BAR:g} of a core", ok=share["asleep"] <= BAR,
-            note=f"with --realtime {share['realtime']:.3f}, and with its spin {share['spin']:.3f}",
+            share["realtime"], "of a core", "bare 1 kHz loop", bare, f"<= {BAR:g} of a core", ok=share["realtime"] <= BAR,
+            note=f"--realtime without the spin; with it {share['spin']:.3f}; as an ordinary process {share['asleep']:.3f}",
         )
         for end, share in shares.items()
     }  # fmt: skip
