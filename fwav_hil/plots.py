@@ -48,7 +48,7 @@ def plot_run(folder: Path, scenario: Scenario, truth: npt.NDArray[np.void], titl
             panel.plot(t, factor * desired[:, axis], color=REFERENCE, linewidth=2.5, alpha=0.7, label="reference")
             panel.plot(t, factor * q[:, axis], color=ACTUAL, linewidth=1.0, label="actual")
             panel.set_title(f"{name} ({unit})")
-        axes[0].legend(loc="best")
+        axes[0].figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
 
     with _grid(plots["error"], f"{title}: error (true state minus reference)", "time (s)") as axes:
         for axis, (panel, (name, factor, unit)) in enumerate(zip(axes, _SHOWN, strict=True)):
