@@ -28,6 +28,9 @@ RESEND_AFTER_S = (0.010, 0.020, 0.040, 0.080, 0.160, 0.320, 0.640, 0.730)
 _LOG_PERIOD_NS = 5_000_000
 """How often the log of a real-time run is handed over: what a kill -9 may cost."""
 
+_MOST_IN_A_PERIOD = 1000
+"""Datagrams that one period's end takes in: a peer that floods the link must not stop the plant."""
+
 
 class Parts(NamedTuple):
     """What a pacing brings together, whichever it is; period_ns: from tick to tick."""
@@ -278,13 +281,8 @@ class RealTime(Pacing):
         if self._sleeps_through:
             self._keeper.sleep()
             self._keeper.tick()
-            link = self.endpoint.link
-            while data := link.recv(0.0):
-                stamp_ns = link.received_ns or self.clock.now_ns()
-                if self._go_on(t_ns, begun_ns, stamp_ns, data):
-                    return  # more may have come, but hardly ever has: it waits for the next tick's turn, with its stamp
-                for frame in self.endpoint.reader.read(data):
-                    self._take(frame, t_ns + self._since(begun_ns, stamp_ns), stamp_ns, stamp_ns)
+            if self._take_what_came(t_ns, begun_ns):
+                return
         else:
             while (wait_s := self._keeper.remaining_s()) is not None:
                 received = self.endpoint.receive(wait_s)
@@ -302,6 +300,22 @@ class RealTime(Pacing):
                 "heartbeat or command: see whether it still runs"
             )
         self.emulator.advance(t_ns + self.period_ns)
+
+    def _take_what_came(self, t_ns: int, begun_ns: int) -> bool:
+        """Take what came in the period that has been slept through; whether that has sent the next tick too."""
+        link = self.endpoint.link
+        for _ in range(_MOST_IN_A_PERIOD):
+            data = link.recv(0.0)
+            if not data:
+                break
+            stamp_ns = link.received_ns or self.clock.now_ns()
+            if self._go_on(t_ns, begun_ns, stamp_ns, data):
+                return (
+                    True  # more may have come, but hardly ever has: it waits for the next tick's turn, with its stamp
+                )
+            for frame in self.endpoint.reader.read(data):
+                self._take(frame, t_ns + self._since(begun_ns, stamp_ns), stamp_ns, stamp_ns)
+        return False
 
     def _since(self, begun_ns: int, moment_ns: int) -> int:
         """How far into its period, begun at begun_ns, a moment of wall time lies."""

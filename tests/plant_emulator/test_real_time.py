@@ -203,3 +203,20 @@ def test_a_plain_answer_takes_the_short_way_where_the_period_is_slept_through(
     fly_some(tmp_path / "plain.npy", 40, lambda writer, tick: [answer(writer, tick * PERIOD_NS)], sleeps_through=True)
     # That of the warm-up, the first, the last, and the one before HIL_GPS is due.
     assert taken == [0, 0, 24, 39]
+
+
+def test_a_flood_does_not_stop_the_plant(tmp_path: Path) -> None:
+    class Flooded(Scripted):
+        def recv(self, timeout_s: float) -> bytes | None:
+            return beat
+
+    beat = FrameWriter(*VEHICLE).seal(mavlink_map.HEARTBEAT, mavlink_map.encode_controller_heartbeat(armed=True))
+    clock = VirtualClock(10**12)
+    link = Flooded(clock, lambda _tick: [])
+    endpoint = Endpoint(link, 1, SCENARIO.wire.emulator_component)
+    emulator = Emulator(SCENARIO, endpoint, None)
+    pacing = RealTime(Parts(emulator, endpoint, None, clock, StopFlag(), PERIOD_NS), ticks=5, sleeps_through=True)
+    for tick in range(5):
+        pacing.exchange(tick, tick * PERIOD_NS)
+    assert emulator.plant.t_ns == 5 * PERIOD_NS
+    assert len(link.sent) == 5
