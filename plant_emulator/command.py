@@ -25,6 +25,7 @@ from bridge.command_line import (
     wait_option,
 )
 from bridge.link import refuse_rate_that_cannot_fit
+from bridge.option_types import FiniteRange
 from bridge.realtime import check_real_time, own_core
 from bridge.summary import show_json
 from plant_emulator.motor_options import chosen_motor_scenario, run_motor_options
@@ -45,7 +46,7 @@ Example:
     ),
     clock_option,
     click.option(
-        "--speed", type=click.FloatRange(min=0.001), metavar="X",
+        "--speed", type=FiniteRange(min=0.001), metavar="X",
         help="Pace lockstep to X times real time; without it, as fast as it goes.",
     ),
     realtime_option,
