@@ -90,10 +90,11 @@ def _how(*, realtime: bool) -> str:
 def _print(
     findings: list[Finding], settings: Settings, trials: list[Trial], verdicts: list[str], *, to_stderr: bool
 ) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr)
+    from fwav_hil.tables import plain_console
+
+    console = plain_console(to_stderr=to_stderr)
     marks = {True: "good", False: "bad", None: "-"}
     table = Table("", "found", "", title="This machine", title_justify="left")
     for finding in findings:
@@ -120,6 +121,6 @@ def _print(
     if remedies:
         console.print("What would mend it:")
     for name, remedy in dict(remedies).items():
-        console.print(f"  {name}: {remedy}", markup=False)
+        console.print(f"  {name}: {remedy}")
     for line in verdicts:
         console.print(line)

@@ -73,11 +73,11 @@ def latency(
     out: Path | None, wait_s: float, json_path: Path | None,
 ) -> None:  # fmt: skip
     """Measure where the time goes between a sample and its command, in the real-time closed loop or on a real link."""
-    from rich.console import Console
+    from fwav_hil.tables import plain_console
 
     to_stderr = is_stdout(json_path)
     terminal = (sys.stderr if to_stderr else sys.stdout).isatty()
-    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr, width=None if terminal else 120)
+    console = plain_console(to_stderr=to_stderr, width=None if terminal else 120)
     if controller_folder and not folder:
         raise UsageError("--controller-from says where the other half of --from DIR is: give both")
     if folder:
