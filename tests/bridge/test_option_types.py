@@ -8,7 +8,7 @@ import click
 import pytest
 
 from bridge.command_line import run_command
-from bridge.option_types import FiniteRange
+from bridge.option_types import FiniteRange, check_speed
 from fwav_hil.cli import cli
 
 NO_NUMBERS = ("nan", "inf", "-inf")
@@ -34,6 +34,7 @@ def test_anything_else_is_refused(text: str) -> None:
         ("margin", "--gain-ratio"),
         ("margin", "--n-filter"),
         ("design", "--out", "never.toml", "--delay-s"),
+        ("run", "--speed"),
         ("emulator", "--wait", "0.1", "--link", "udpin://127.0.0.1:0", "--speed"),
     ],
 )
@@ -45,3 +46,24 @@ def test_every_command_says_so_in_one_line(
     assert said.count("\n") == 1
     assert arguments[-1] in said
     assert not Path("never.toml").exists()
+
+
+@pytest.mark.parametrize("command", ["run", "emulator"])
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--clock", "realtime", "--speed", "2"), "leave one of them out"),
+        (("--speed", "0.001"), "is a tick every 4 s, for which no end waits: choose --speed 0.004 or more"),
+    ],
+)
+def test_a_speed_that_cannot_be_kept_is_refused(
+    command: str, arguments: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert run_command(cli, "fwav-hil", [command, "flapper", *arguments, "--out", str(tmp_path / "run")]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_speed_in_its_range_is_taken() -> None:
+    for clock, speed in (("lockstep", None), ("lockstep", 0.004), ("realtime", None)):
+        check_speed(clock, speed, 250.0)
