@@ -12,7 +12,7 @@ import numpy as np
 from bridge.clock import MonotonicClock, processor_time_ns
 from bridge.endpoint import VEHICLE, Endpoint, refuse_other_scenario
 from bridge.faults import DelayedLink
-from bridge.legs import ANSWER_COLUMNS, EMULATOR_FILE, TICK_COLUMNS, LegTable, save_legs
+from bridge.legs import ANSWER_COLUMNS, CLOCK_COLUMNS, EMULATOR_FILE, TICK_COLUMNS, LegTable, save_legs
 from bridge.link import Link
 from bridge.memory import memory_pair
 from bridge.process import Report, StopFlag, open_patiently
@@ -291,7 +291,11 @@ def _run_ticks(
         write_json(out / "emulator.json", summary)
         if isinstance(pacing, RealTime) and pacing.legs:
             ticks, answers = pacing.legs
-            save_legs(out / EMULATOR_FILE, {"ticks": ticks, "answers": answers}, pacing.time_sync.estimate)
+            clocks = LegTable(CLOCK_COLUMNS)
+            for answer in pacing.time_sync.answers:
+                clocks.add(*answer)
+            tables = {"ticks": ticks, "answers": answers, "clocks": clocks}
+            save_legs(out / EMULATOR_FILE, tables, pacing.time_sync.estimate)
     report({"event": "ended", **summary})
     if error:
         raise error

@@ -176,7 +176,7 @@ class TestFromAFolder:
         assert latency("--from", folder, "--controller-from", other, "--json", tmp_path / "result.json") == 0
         result = json.loads((tmp_path / "result.json").read_text())
         assert result["legs_us"]["compute"]["count"] > 50
-        assert set(result["time_sync"]) == {"offset_us", "bound_us", "answers"}
+        assert set(result["time_sync"]) == {"offset_us", "offset_at_end_us", "bound_us", "answers"}
         assert "the controller's clock is ahead by" in capsys.readouterr().out
 
     def test_the_report_may_go_elsewhere_and_leaves_the_run_as_it_was(
