@@ -28,6 +28,8 @@ LOST_AFTER_NS: Final = 10_000_000_000
 
 _BUS_OFF = 0x40  # CAN_ERR_BUSOFF in the identifier of an error frame (linux/can/error.h)
 _ECHOES = 256
+_MOST_LOOKS = 1000
+"""In one receive whose time is up, for something that is for the caller."""
 _EXAMPLES: Final = {
     "udp_multicast": "udp_multicast:239.74.163.2",
     "virtual": "virtual:motors",
@@ -145,19 +147,22 @@ class CanBus:
             if self._away():
                 self._clock.sleep_until_ns(min(deadline_ns, self._reopen_ns))
             else:
-                frame = self._receive(timeout_s)
+                frame = self._receive(deadline_ns)
                 if frame is not None:
                     return frame
-            remaining_ns = deadline_ns - self._clock.now_ns()
-            if remaining_ns <= 0:
+            if self._clock.now_ns() >= deadline_ns:
                 return None
-            timeout_s = remaining_ns * 1e-9
 
-    def _receive(self, timeout_s: float) -> CanFrame | None:
-        """One receive; None where nothing came, or nothing that is for the caller."""
+    def _receive(self, deadline_ns: int) -> CanFrame | None:
+        """The next frame that is for the caller; None where none came in time, or the interface had something to report."""
+        looks = 0
         while True:
+            remaining_ns = max(0, deadline_ns - self._clock.now_ns())
+            looks += 1
+            if looks > _MOST_LOOKS and not remaining_ns:
+                return None
             try:
-                message = self._bus.recv(timeout_s)
+                message = self._bus.recv(remaining_ns * 1e-9)
             except (can.CanError, OSError) as error:
                 cause = error.__cause__
                 if cause is None or isinstance(cause, OSError):

@@ -15,7 +15,7 @@ from bridge.endpoint import VEHICLE
 from bridge.link import Link
 from protocol import mavlink_map
 from protocol.can_frame import CanFrame
-from protocol.errors import LinkClosedError
+from protocol.errors import LinkError
 from protocol.mavlink_codec import FrameReader, FrameWriter, Layout
 from protocol.scenario import NANOSECONDS
 from protocol.streams import Due
@@ -25,7 +25,10 @@ _MOST_AT_ONCE = 64
 
 
 class CanTap:
-    """One station's tap on one bus.
+    """The tap of one station at a time on one bus.
+
+    A station that hangs up, takes nothing or has not renewed its request for 5 s makes room for another. Whatever its link
+    does, the flight goes on.
 
     counters   tap_sent       frames shown       tap_taken     frames of the station, for the bus
                tap_requests   times forwarding was asked for or renewed    tap_refused   frames and requests not for this bus
@@ -57,11 +60,13 @@ class CanTap:
     def poll(self) -> list[CanFrame]:
         """Take what the station says, without waiting; returns its frames for the bus."""
         frames: list[CanFrame] = []
+        if self._until_ns is not None and not self.forwarding:
+            self._forget_station()
         for _ in range(_MOST_AT_ONCE):
             try:
                 data = self._link.recv(0.0)
-            except LinkClosedError:
-                self._until_ns = None
+            except LinkError:
+                self._forget_station()
                 break
             if not data:
                 break
@@ -96,5 +101,9 @@ class CanTap:
     def _send(self, message: Layout, payload: bytes) -> None:
         try:
             self._link.send(self._writer.seal(message, payload))
-        except LinkClosedError:
-            self._until_ns = None
+        except LinkError:
+            self._forget_station()
+
+    def _forget_station(self) -> None:
+        self._until_ns = None
+        self._link.release_peer()

@@ -89,5 +89,7 @@ class DelayedLink(Link):
         return self._link.peer
 
     def release_peer(self) -> None:
-        """As the link does."""
+        """As the link does; what the last peer's closing left, and what is on its way from it, are forgotten too."""
+        self._held.clear()
+        self._ended_by = None
         self._link.release_peer()

@@ -1,7 +1,8 @@
 """Where each sample and its command were, and when: rows of time stamps that either end gathers while it runs.
 
 All stamps are of the end's own `MonotonicClock`, ns, and 0 where unknown. A sample is told by its simulation time, which the
-command echoes, so the rows of both ends join; `TimeSync` says how their clocks relate where they run on two machines.
+command echoes, so the rows of both ends join; the answers to TIMESYNC say how their clocks relate where they run on two
+machines.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ ANSWER_COLUMNS = ("t_ns", "kernel_ns", "woke_ns", "applied_ns", "acts_ns")
 """Emulator, per command: received by the kernel; fetched from it; handed to the plant; simulation time it acts from."""
 SAMPLE_COLUMNS = ("t_ns", "kernel_ns", "woke_ns", "computed_ns", "sent_ns")
 """Controller, per sample: received by the kernel; fetched from it; command computed; handed to the link."""
+CLOCK_COLUMNS = ("at_ns", "offset_ns", "round_trip_ns")
+"""Emulator, per answer to TIMESYNC: how far the controller's clock was ahead then, and twice the bound of that."""
 EMULATOR_FILE, CONTROLLER_FILE = "legs_emulator.npz", "legs_controller.npz"
 
 Rows = npt.NDArray[np.int64]
-_TABLES = {"ticks": TICK_COLUMNS, "answers": ANSWER_COLUMNS, "samples": SAMPLE_COLUMNS}
+_TABLES = {"ticks": TICK_COLUMNS, "answers": ANSWER_COLUMNS, "samples": SAMPLE_COLUMNS, "clocks": CLOCK_COLUMNS}
 _BLOCK = 65536
 
 
@@ -66,7 +69,7 @@ def save_legs(path: Path, tables: dict[str, LegTable], clock: Estimate | None) -
 
 
 def load_legs(path: Path, *names: str) -> tuple[list[Rows], Estimate | None]:
-    """The tables of these names (ticks, answers, samples), and the clock's estimate; see `save_legs`.
+    """The tables of these names (ticks, answers, samples, clocks), and the clock's estimate; see `save_legs`.
 
     Raises RunFolderError where there is no such file, or not what was written.
     """

@@ -92,4 +92,6 @@ def probe(
                 counts["out_of_order"] += number < newest
                 newest = max(newest, number)
     known = came >= 0
-    return ProbeResult(np.where(known, came - due, -1), np.where(known, came - sent, -1), **counts)
+    # A kernel's stamp is taken on the wall clock: were that set meanwhile, an answer must not count as lost.
+    from_due_ns, from_sent_ns = (np.where(known, np.maximum(came - since, 0), -1) for since in (due, sent))
+    return ProbeResult(from_due_ns, from_sent_ns, **counts)

@@ -7,13 +7,14 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TextIO
 
 import msgspec
 
 from bridge.clock import MonotonicClock
 from bridge.link import Link, open_link
-from protocol.errors import Interrupted, PeerMissingError
+from protocol.errors import Interrupted, PeerMissingError, RunFolderError
 
 Report = Callable[[dict[str, Any]], None]
 """Takes one event of a process: a dictionary with the key "event"."""
@@ -57,6 +58,21 @@ def open_patiently(uri: str, wait_s: float, stop: StopFlag) -> Link:
         except PeerMissingError:
             if clock.now_ns() >= give_up_ns:
                 raise
+
+
+def take_folder(folder: Path, *names: str) -> None:
+    """Make the folder that a process writes files of these names to at its end, before it begins.
+
+    Raises RunFolderError where it cannot be made, or holds one of them: what is there stays.
+    """
+    from bridge.summary import make_folder  # here: who only wants signals need not wait for numpy
+
+    for name in names:
+        if (folder / name).exists():
+            raise RunFolderError(
+                f"{folder / name} is there already, and stays: choose another folder with --out, or remove it"
+            )
+    make_folder(folder)
 
 
 def end_with_parent() -> None:

@@ -2,8 +2,10 @@
 
 A question carries our time (ts1) and tc1 = 0; the answer gives ts1 back beside the answerer's time (tc1). The offset is
 tc1 - (ts1 + arrival) / 2, wrong by half the round trip at most; of the newest answers the one with the shortest round trip
-is believed. Source: the MAVLink time synchronisation service (v2), of which the released dialect has the fields tc1 and ts1
-only: whose question an answer belongs to is told by its ts1.
+is believed. Clocks drift, so that holds for the time of the answer: who needs other times has all answers.
+
+Source: the MAVLink time synchronisation service (v2), of which the released dialect has the fields tc1 and ts1 only: whose
+question an answer belongs to is told by its ts1.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ _REMEMBERED = 16
 
 
 class Estimate(NamedTuple):
-    """offset_ns: the other clock less ours; round_trip_ns: twice the bound of its error; answers: how many came."""
+    """offset_ns: the other clock less ours, then; round_trip_ns: twice the bound of its error; answers: how many came."""
 
     offset_ns: int
     round_trip_ns: int
@@ -37,14 +39,17 @@ class Estimate(NamedTuple):
 
 
 class TimeSync:
-    """Asks and answers at one end of a link: a burst at the start, then once a second."""
+    """Asks and answers at one end of a link: a burst at the start, then once a second.
+
+    answers   of each that came: our time half way between question and answer, the offset then, the round trip; ns
+    """
 
     def __init__(self, endpoint: Endpoint, clock: Clock) -> None:
         self._endpoint = endpoint
         self._clock = clock
         self._asked: deque[int] = deque(maxlen=_REMEMBERED)
-        self._answers: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
-        self._questions = self._count = 0
+        self.answers: list[tuple[int, int, int]] = []
+        self._questions = 0
         self.next_ns = 0
         """When the next question is due, on the clock."""
 
@@ -64,14 +69,14 @@ class TimeSync:
             return self._endpoint.seal(mavlink_map.TIMESYNC, payload)
         if asked_ns in self._asked and arrived_ns >= asked_ns:
             self._asked.remove(asked_ns)
-            self._count += 1
-            self._answers.append((arrived_ns - asked_ns, answer_ns - (asked_ns + arrived_ns) // 2))
+            middle_ns = (asked_ns + arrived_ns) // 2
+            self.answers.append((middle_ns, answer_ns - middle_ns, arrived_ns - asked_ns))
         return None
 
     @property
     def estimate(self) -> Estimate | None:
         """The offset by the best of the newest answers; None where none came yet."""
-        if not self._answers:
+        if not self.answers:
             return None
-        round_trip_ns, offset_ns = min(self._answers)
-        return Estimate(offset_ns, round_trip_ns, self._count)
+        _, offset_ns, round_trip_ns = min(self.answers[-_REMEMBERED:], key=lambda answer: answer[2])
+        return Estimate(offset_ns, round_trip_ns, len(self.answers))

@@ -17,10 +17,10 @@ from bridge.endpoint import VEHICLE, Endpoint
 from bridge.legs import CONTROLLER_FILE, SAMPLE_COLUMNS, LegTable, save_legs
 from bridge.link import Link
 from bridge.memory import memory_pair
-from bridge.process import Report, StopFlag, open_patiently
+from bridge.process import Report, StopFlag, open_patiently, take_folder
 from bridge.rate import RateKeeper, choose_spin_ns
 from bridge.realtime import has_own_core, maybe_real_time, report_settings
-from bridge.summary import make_folder, write_json
+from bridge.summary import write_json
 from bridge.timesync import TimeSync
 from controller.actuation import HilActuation
 from controller.law import Law
@@ -35,6 +35,7 @@ from protocol.scenario import Scenario
 from protocol.streams import HEARTBEAT_TIMEOUT_NS, Due
 from protocol.tick_frames import CommandWriter
 
+RESULT = "controller.json"
 HELLO_PERIOD_S = 0.1
 LOOK_PERIOD_S = 0.1
 PATIENCE_PERIODS = 1.5
@@ -335,6 +336,8 @@ def run_controller(scenario: Scenario, options: ControllerOptions, report: Repor
     law = make_law(scenario.law, scenario)
     if options.legs and (options.clock != "realtime" or not options.out):
         raise UsageError("--legs notes times of a real-time run in a folder: add --clock realtime and --out DIR")
+    if options.out:
+        take_folder(options.out, RESULT, CONTROLLER_FILE)
     warm_up(law)
     uri = _told_link() if options.link == "-" else options.link
     report({"event": "waiting", "link": uri})
@@ -386,8 +389,7 @@ def serve(
         "error": str(error) if error else None,
     }
     if options.out:
-        make_folder(options.out)
-        write_json(options.out / "controller.json", summary)
+        write_json(options.out / RESULT, summary)
         if controller.legs:
             save_legs(options.out / CONTROLLER_FILE, {"samples": controller.legs}, controller.time_sync.estimate)
     report({"event": "ended", **summary})

@@ -45,16 +45,17 @@ def budget(scenario: str, link: str, rate: float | None, json_path: Path | None)
 
 
 def _print(found: Budget, planned_s: float, *, to_stderr: bool) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr)
+    from fwav_hil.tables import plain_console
+
+    console = plain_console(to_stderr=to_stderr)
     table = Table("message", title=f"{found.link} at {found.rate_hz:g} Hz", title_justify="left")
     for column in ("bytes", "rate", "bytes/s", "share"):
         table.add_column(column, justify="right")
     for way in found.ways:
         capacity = way.capacity_bytes_per_s
-        table.add_row(f"[bold]{way.name}[/bold]")
+        table.add_row(way.name, style="bold")
         for row in way.messages:
             size, often = str(row.frame_bytes), f"{row.rate_hz:g} Hz"
             table.add_row(

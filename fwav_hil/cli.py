@@ -30,6 +30,7 @@ from bridge.command_line import (
     trigger_option,
     wait_option,
 )
+from bridge.option_types import check_speed, speed_option
 from bridge.summary import is_stdout, show_json
 from fwav_hil import __version__
 from plant_emulator.motor_options import chosen_motor_scenario, run_motor_options
@@ -112,9 +113,7 @@ plots_option = click.option("--plots/--no-plots", default=True, show_default=Tru
     scenario_argument,
     law_option,
     clock_option,
-    click.option(
-        "--speed", type=click.FloatRange(min=0.001), metavar="X", help="Pace lockstep to X times real time.",
-    ),
+    speed_option,
     realtime_option,
     trigger_option,
     spin_option,
@@ -178,6 +177,7 @@ def run_command(
 
     refuse_on_a_link(chosen)
     check_real_time(clock, realtime=realtime, trigger=trigger)
+    check_speed(clock, speed, chosen.rate_hz)
     check_link(link)
     if clock == "realtime":
         refuse_rate_that_cannot_fit(link, chosen.rate_hz)

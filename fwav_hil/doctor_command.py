@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from bridge.command_line import json_option, options
+from bridge.option_types import FiniteRange
 from bridge.summary import is_stdout, show_json
 
 if TYPE_CHECKING:
@@ -22,11 +23,11 @@ UNKEPT_EXIT_CODE = 1
 @click.command("doctor", epilog="\b\nExample:\n  fwav-hil doctor --rate 500 --seconds 10 --json machine.json")
 @options(
     click.option(
-        "--seconds", type=click.FloatRange(min=0.1), default=5.0, show_default=True, metavar="S",
+        "--seconds", type=FiniteRange(min=0.1), default=5.0, show_default=True, metavar="S",
         help="Length of each trial; there are two for each rate.",
     ),
     click.option(
-        "--rate", "rates_hz", type=click.FloatRange(min=1.0, max=100_000.0), multiple=True, default=RATES_HZ,
+        "--rate", "rates_hz", type=FiniteRange(min=1.0, max=100_000.0), multiple=True, default=RATES_HZ,
         show_default=True, metavar="HZ", help="A rate to try; may be given several times.",
     ),
     json_option,
@@ -89,10 +90,11 @@ def _how(*, realtime: bool) -> str:
 def _print(
     findings: list[Finding], settings: Settings, trials: list[Trial], verdicts: list[str], *, to_stderr: bool
 ) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr)
+    from fwav_hil.tables import plain_console
+
+    console = plain_console(to_stderr=to_stderr)
     marks = {True: "good", False: "bad", None: "-"}
     table = Table("", "found", "", title="This machine", title_justify="left")
     for finding in findings:
@@ -119,6 +121,6 @@ def _print(
     if remedies:
         console.print("What would mend it:")
     for name, remedy in dict(remedies).items():
-        console.print(f"  {name}: {remedy}", markup=False)
+        console.print(f"  {name}: {remedy}")
     for line in verdicts:
         console.print(line)

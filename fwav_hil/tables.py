@@ -13,9 +13,14 @@ from protocol.messages import AXES
 DEGREES = 180.0 / math.pi
 
 
+def plain_console(*, to_stderr: bool = False, width: int | None = None) -> Console:
+    """A console that shows text as it is: in a path or a URI, `[x]` is no markup to it and `:b:` no emoji."""
+    return Console(highlight=False, markup=False, emoji=False, soft_wrap=True, stderr=to_stderr, width=width)
+
+
 def print_summary(summary: dict[str, Any], *, to_stderr: bool = False) -> None:
     """Print the result of a run: tracking by axis, then one line each of what was counted and measured."""
-    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr)
+    console = plain_console(to_stderr=to_stderr)
     console.print(_tracking_table(summary))
     rate, lockstep = summary["ticks_per_s"], summary["clock"] == "lockstep"
     mode = f", {summary['clock']}" if summary["clock"] else ""
@@ -94,4 +99,4 @@ def print_spread(spread: dict[str, Any], *, to_stderr: bool = False) -> None:
         )
     for axis in AXES:
         table.add_row(axis, *(show_error(axis, spread[name][axis]) for name in columns))
-    Console(highlight=False, stderr=to_stderr).print(table)
+    plain_console(to_stderr=to_stderr).print(table)

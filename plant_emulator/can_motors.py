@@ -218,7 +218,7 @@ class CanMotors:
         if not self._all_enabled and (self._enable_ns is None or t_ns - self._enable_ns >= ENABLE_AGAIN_NS):
             self._enable_ns = t_ns
             self._counters["motor_enables"] += 1
-            frames += self._host.enable()
+            frames += self._host.enable([axis for axis in range(DRIVES) if not self._enabled >> axis & 1])
         frames += self._host.command(tau / self._scale)
         if self._syncs:
             frames.append(motor_lockstep.encode_sync(t_ns))
@@ -322,6 +322,7 @@ class CanMotors:
                 return  # the last u is held
             self._out_ns = now_ns
             self._all_enabled = False
+            self._enabled = 0
             self._counters["motor_outages"] += 1
             self._report({"event": "motors_lost", "t_ns": t_ns})
         self._counters["motor_outage_ticks"] += 1

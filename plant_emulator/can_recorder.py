@@ -5,6 +5,7 @@ Stamps are the run's own time: simulation time in lockstep and real time alike, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,22 +26,28 @@ def check_suffix(path: Path) -> None:
 
 
 class CanRecorder:
-    """Keeps frames until `settle`, which is called where there is time. Raises RunFolderError where it cannot write."""
+    """Keeps frames until `settle`, which is called where there is time.
 
-    def __init__(self, path: Path) -> None:
+    Where the disk refuses, RunFolderError is raised; with `tell`, that hears of it once instead, and the record ends there.
+    """
+
+    def __init__(self, path: Path, tell: Callable[[str], None] | None = None) -> None:
         check_suffix(path)
         self.path = path
+        self._tell = tell
+        self._is_full = False
         self._owed: list[tuple[int, CanFrame]] = []
         if path.exists():
             raise RunFolderError(f"{path} exists already, and stays: choose another name for the record of the bus")
         try:
             self._writer: Any = can.Logger(path)
         except OSError as error:
-            raise RunFolderError(f"cannot write the record of the bus {path}: {error.strerror}") from None
+            raise self._refused(error) from None
 
     def watch(self, t_ns: int, frame: CanFrame) -> None:
         """Have a frame recorded under a time (ns)."""
-        self._owed.append((t_ns, frame))
+        if not self._is_full:
+            self._owed.append((t_ns, frame))
 
     def settle(self) -> None:
         """Write what is owed."""
@@ -57,14 +64,25 @@ class CanRecorder:
                     )
                 )
         except OSError as error:
-            raise RunFolderError(f"cannot write the record of the bus {self.path}: {error.strerror}") from None
+            self._give_up(error)
         finally:
             self._owed.clear()
 
     def close(self) -> None:
         """Write what is owed and close."""
+        self.settle()
         try:
-            self.settle()
             self._writer.stop()
         except OSError as error:
-            raise RunFolderError(f"cannot write the record of the bus {self.path}: {error.strerror}") from None
+            self._give_up(error)
+
+    def _give_up(self, error: OSError) -> None:
+        if self._is_full:
+            return  # said already
+        self._is_full = True
+        if self._tell is None:
+            raise self._refused(error) from None
+        self._tell(str(self._refused(error)))
+
+    def _refused(self, error: OSError) -> RunFolderError:
+        return RunFolderError(f"cannot write the record of the bus {self.path}: {error.strerror}")

@@ -25,6 +25,7 @@ from bridge.command_line import (
     wait_option,
 )
 from bridge.link import refuse_rate_that_cannot_fit
+from bridge.option_types import check_speed, speed_option
 from bridge.realtime import check_real_time, own_core
 from bridge.summary import show_json
 from plant_emulator.motor_options import chosen_motor_scenario, run_motor_options
@@ -44,10 +45,7 @@ Example:
         help="Where the controller is: udpin://, udpout://, tcpin://, tcpout://, serial:///dev/x:baud.",
     ),
     clock_option,
-    click.option(
-        "--speed", type=click.FloatRange(min=0.001), metavar="X",
-        help="Pace lockstep to X times real time; without it, as fast as it goes.",
-    ),
+    speed_option,
     realtime_option,
     spin_option,
     rate_option,
@@ -95,6 +93,7 @@ def emulator(
     """Run the plant emulator alone: it waits for a controller, then flies SCENARIO (a file or a name) with it."""
     chosen = chosen_motor_scenario(scenario, protocol=protocol, lag_s=lag, rate_hz=rate, duration_s=duration, seed=seed)
     check_real_time(clock, realtime=realtime)
+    check_speed(clock, speed, chosen.rate_hz)
     if clock == "realtime" or speed:
         refuse_rate_that_cannot_fit(link, chosen.rate_hz * (1.0 if clock == "realtime" else speed or 1.0))
     report, stop = begin_process(status, core, with_parent=with_parent)

@@ -11,12 +11,13 @@ import msgspec
 
 from bridge.can_bus import CanBus
 from bridge.clock import Clock, MonotonicClock
-from bridge.process import Report, StopFlag
-from bridge.summary import make_folder, write_json
+from bridge.process import Report, StopFlag, take_folder
+from bridge.summary import write_json
 from plant_emulator.motor_node import MotorNode, is_of_drives, warm_up
 from protocol.errors import FwavHilError, LinkInUseError
 from protocol.scenario import NANOSECONDS, Scenario
 
+RESULT = "motor.json"
 LISTEN_S = 0.25
 """Time in which drives that are on the bus already are noticed: they show their encoders far more often."""
 LOCKSTEP_WAIT_S = 0.1
@@ -34,6 +35,8 @@ class MotorOptions(msgspec.Struct, frozen=True, kw_only=True):
 
 def run_motor(scenario: Scenario, options: MotorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
     """Be the six drives on a bus until asked to stop; returns what was counted. Raises the errors of `protocol.errors`."""
+    if options.out:
+        take_folder(options.out, RESULT)
     warm_up(scenario, options.protocol)
     with CanBus(options.can, scenario.motor.bitrate) as bus:
         clock = MonotonicClock()
@@ -53,8 +56,7 @@ def run_motor(scenario: Scenario, options: MotorOptions, report: Report, stop: S
             "error": str(error) if error else None,
         }
     if options.out:
-        make_folder(options.out)
-        write_json(options.out / "motor.json", summary)
+        write_json(options.out / RESULT, summary)
     report({"event": "ended", **summary})
     if error:
         raise error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,9 +27,17 @@ LOG_NAME = "motor_bus.blf"
 
 @contextlib.contextmanager
 def open_motors(
-    scenario: Scenario, link: MotorLink, out: Path | None, *, clock: str, wait_s: float, report: Report, stop: StopFlag
+    scenario: Scenario,
+    link: MotorLink,
+    out: Path | None,
+    *,
+    clock: str,
+    wait_s: float,
+    report: Report,
+    stop: StopFlag,
+    tell: Callable[[str], None] | None = None,
 ) -> Iterator[CanMotors]:
-    """The drives of a run, met. On a `virtual:` bus they live in a thread of this process.
+    """The drives of a run, met. On a `virtual:` bus they live in a thread of this process. `tell`: see `CanRecorder`.
 
     Raises the errors of `CanBus`, `plan_bus`, `CanMotors.meet`.
     """
@@ -52,7 +60,7 @@ def open_motors(
         )
         path = link.log or (out / LOG_NAME if out else None)
         if path:
-            recorder = CanRecorder(path)
+            recorder = CanRecorder(path, tell)
             stack.callback(recorder.close)
             motors.watches.append(recorder.watch)
             motors.poll.append(recorder.settle)

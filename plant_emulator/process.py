@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from bridge.clock import MonotonicClock, processor_time_ns
 from bridge.endpoint import VEHICLE, Endpoint, refuse_other_scenario
 from bridge.faults import DelayedLink
-from bridge.legs import ANSWER_COLUMNS, EMULATOR_FILE, TICK_COLUMNS, LegTable, save_legs
+from bridge.legs import ANSWER_COLUMNS, CLOCK_COLUMNS, EMULATOR_FILE, TICK_COLUMNS, LegTable, save_legs
 from bridge.link import Link
 from bridge.memory import memory_pair
 from bridge.process import Report, StopFlag, open_patiently
@@ -130,11 +131,7 @@ def _open_files(
     scenario: Scenario, link: Link, options: EmulatorOptions, out: Path, report: Report
 ) -> tuple[TlogWriter | None, TruthWriter | None]:
     """Begin the log and the ground truth of a run; None each where the disk refuses and the user chose to go on."""
-
-    def tell(sentence: str) -> None:
-        report({"event": "warning", "text": f"{sentence}; the run goes on"})
-
-    goes_on = options.on_log_error == "continue"
+    tell = _teller(options, report)
     source = {
         "scenario": scenario.name,
         "law": scenario.law,
@@ -151,16 +148,21 @@ def _open_files(
     try:
         make_folder(out)
         write_text(out / "scenario.toml", scenario.to_toml())
-        truth = TruthWriter(out / "ground_truth.npy", tell=tell if goes_on else None)
-        log = RingRecorder(
-            out / "run.tlog", recorded, stamps=stamps, source=source, may_wait=lockstep, tell=tell if goes_on else None
-        )
+        truth = TruthWriter(out / "ground_truth.npy", tell=tell)
+        log = RingRecorder(out / "run.tlog", recorded, stamps=stamps, source=source, may_wait=lockstep, tell=tell)
     except RunFolderError as error:
-        if not goes_on:
+        if tell is None:
             _close_files(log, truth)
             raise
         tell(str(error))
     return log, truth
+
+
+def _teller(options: EmulatorOptions, report: Report) -> Callable[[str], None] | None:
+    """Who hears of a disk that refuses, where the user chose to go on; None: it ends the run."""
+    if options.on_log_error != "continue":
+        return None
+    return lambda sentence: report({"event": "warning", "text": f"{sentence}; the run goes on"})
 
 
 def warm_up(scenario: Scenario) -> None:
@@ -185,7 +187,14 @@ def _motors(
     from plant_emulator.motor_setup import open_motors
 
     return open_motors(
-        scenario, options.motors, options.out, clock=options.clock, wait_s=options.wait_s, report=report, stop=stop
+        scenario,
+        options.motors,
+        options.out,
+        clock=options.clock,
+        wait_s=options.wait_s,
+        report=report,
+        stop=stop,
+        tell=_teller(options, report),
     )
 
 
@@ -291,7 +300,11 @@ def _run_ticks(
         write_json(out / "emulator.json", summary)
         if isinstance(pacing, RealTime) and pacing.legs:
             ticks, answers = pacing.legs
-            save_legs(out / EMULATOR_FILE, {"ticks": ticks, "answers": answers}, pacing.time_sync.estimate)
+            clocks = LegTable(CLOCK_COLUMNS)
+            for answer in pacing.time_sync.answers:
+                clocks.add(*answer)
+            tables = {"ticks": ticks, "answers": answers, "clocks": clocks}
+            save_legs(out / EMULATOR_FILE, tables, pacing.time_sync.estimate)
     report({"event": "ended", **summary})
     if error:
         raise error

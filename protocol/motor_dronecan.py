@@ -26,7 +26,7 @@ from dronecan import transport
 from protocol import motor_protocol
 from protocol.can_frame import CanFrame
 from protocol.messages import AXES, FloatArray
-from protocol.motor_protocol import DRIVES, Action, Cause, Order, Reading, Status, Traffic
+from protocol.motor_protocol import AXIS_NUMBERS, DRIVES, Action, Cause, Order, Reading, Status, Traffic
 from protocol.scenario import NANOSECONDS, Motor
 from protocol.streams import Due
 
@@ -111,7 +111,7 @@ class Host(motor_protocol.Host):
         self._sender, self._receiver = _Sender(), _Receiver()
         self._node_status = Due(NODE_STATUS_RATE_HZ)
 
-    def enable(self) -> list[CanFrame]:
+    def enable(self, axes: Sequence[int] = AXIS_NUMBERS) -> list[CanFrame]:
         return self._command([0] * DRIVES)
 
     def disable(self) -> list[CanFrame]:

@@ -24,7 +24,7 @@ from protocol import motor_protocol
 from protocol.can_frame import CanFrame
 from protocol.errors import ScenarioError
 from protocol.messages import FloatArray
-from protocol.motor_protocol import DRIVES, Action, Cause, Fault, Order, Reading, Status, Traffic
+from protocol.motor_protocol import AXIS_NUMBERS, DRIVES, Action, Cause, Fault, Order, Reading, Status, Traffic
 from protocol.scenario import Motor
 
 MASTER = 0x000
@@ -74,8 +74,11 @@ class Host(motor_protocol.Host):
         self._blank = int.from_bytes(pack_command(*centre, 0, 0, 0), "big")
         self._next = 0
 
-    def enable(self) -> list[CanFrame]:
-        return [CanFrame(drive, data) for data in (EXIT, ENTER) for drive in self._ids]
+    def enable(self, axes: Sequence[int] = AXIS_NUMBERS) -> list[CanFrame]:
+        # EXIT clears errors and lets go: a drive that flies must not get it. Replies in the order of commands, though,
+        # are told apart by their number alone.
+        chosen = AXIS_NUMBERS if self.motor.mit_reply_bytes == 5 else axes
+        return [CanFrame(self._ids[axis], data) for data in (EXIT, ENTER) for axis in chosen]
 
     def disable(self) -> list[CanFrame]:
         return [CanFrame(drive, EXIT) for drive in self._ids]

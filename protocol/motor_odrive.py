@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from protocol import motor_protocol
 from protocol.can_frame import CanFrame
 from protocol.messages import FloatArray
-from protocol.motor_protocol import DRIVES, Action, Cause, Fault, Order, Reading, Status, Traffic
+from protocol.motor_protocol import AXIS_NUMBERS, DRIVES, Action, Cause, Fault, Order, Reading, Status, Traffic
 from protocol.scenario import Motor
 from protocol.streams import Due
 
@@ -67,18 +67,17 @@ class Host(motor_protocol.Host):
         nodes = range(motor.first_node_id, motor.first_node_id + DRIVES)
         self._torque_ids = [node << 5 | SET_INPUT_TORQUE for node in nodes]
         self._enable = [
-            frame
-            for node in nodes
-            for frame in (
+            (
                 CanFrame(node << 5 | CLEAR_ERRORS, b"\0"),
                 CanFrame(node << 5 | SET_CONTROLLER_MODE, _TWO_UINTS.pack(TORQUE_CONTROL, PASSTHROUGH)),
                 CanFrame(node << 5 | SET_AXIS_STATE, _UINT.pack(CLOSED_LOOP_CONTROL)),
             )
+            for node in nodes
         ]
         self._disable = [CanFrame(node << 5 | SET_AXIS_STATE, _UINT.pack(IDLE)) for node in nodes]
 
-    def enable(self) -> list[CanFrame]:
-        return list(self._enable)
+    def enable(self, axes: Sequence[int] = AXIS_NUMBERS) -> list[CanFrame]:
+        return [frame for axis in axes for frame in self._enable[axis]]
 
     def disable(self) -> list[CanFrame]:
         return list(self._disable)

@@ -22,6 +22,7 @@ from protocol.messages import AXES, FloatArray
 from protocol.scenario import Motor
 
 DRIVES: Final = len(AXES)
+AXIS_NUMBERS: Final = tuple(range(DRIVES))
 
 
 class Cause(enum.Enum):
@@ -131,8 +132,11 @@ class Host(abc.ABC):
         self.motor = motor
 
     @abc.abstractmethod
-    def enable(self) -> list[CanFrame]:
-        """The frames that clear errors and make all drives follow torque commands."""
+    def enable(self, axes: Sequence[int] = AXIS_NUMBERS) -> list[CanFrame]:
+        """The frames that clear errors and make the drives of these axes follow torque commands.
+
+        Where a protocol cannot tell them apart they go to all, which must then not disturb a drive that follows already.
+        """
 
     @abc.abstractmethod
     def disable(self) -> list[CanFrame]:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from bridge.legs import ANSWER_COLUMNS, CONTROLLER_FILE, EMULATOR_FILE, SAMPLE_COLUMNS, TICK_COLUMNS, Rows, load_legs
 from bridge.timesync import Estimate
+from fwav_hil.latency.clocks import offset_at
 
 LEGS = {
     "wake": "due -> emulator wakes",
@@ -34,6 +35,8 @@ class Legs(NamedTuple):
     delay_ns (n,)  from the sample to the action of its command, in simulation time
     clock          TIMESYNC's estimate of the controller's clock less the emulator's, None where nobody answered
     negative       durations that came out negative and count as 0: so much for the clocks
+    offset_ns      of two clocks: the controller's less the emulator's at each sample, and the bound of its error (n,) each;
+    offset_error_ns    None where there is one clock, or where nobody answered
     """
 
     t_ns: Rows
@@ -41,6 +44,8 @@ class Legs(NamedTuple):
     delay_ns: Rows
     clock: Estimate | None
     negative: int
+    offset_ns: Rows | None = None
+    offset_error_ns: Rows | None = None
 
     def known(self, leg: str) -> Rows:
         """The durations of a leg, those that are known."""
@@ -53,24 +58,29 @@ def join_legs(folder: Path, controller_folder: Path | None = None) -> Legs:
 
     Raises RunFolderError.
     """
-    (ticks, answers), clock = load_legs(folder / EMULATOR_FILE, "ticks", "answers")
     (samples,), _ = load_legs((controller_folder or folder) / CONTROLLER_FILE, "samples")
-    offset_ns = 0 if controller_folder is None else clock.offset_ns if clock else None
-    return legs_of(ticks, answers, samples, clock, offset_ns=offset_ns)
+    if controller_folder is None:
+        (ticks, answers), clock = load_legs(folder / EMULATOR_FILE, "ticks", "answers")
+        return legs_of(ticks, answers, samples, clock)
+    (ticks, answers, clocks), clock = load_legs(folder / EMULATOR_FILE, "ticks", "answers", "clocks")
+    return legs_of(ticks, answers, samples, clock, clocks=clocks)
 
 
-def legs_of(ticks: Rows, answers: Rows, samples: Rows, clock: Estimate | None, *, offset_ns: int | None = 0) -> Legs:
+def legs_of(ticks: Rows, answers: Rows, samples: Rows, clock: Estimate | None, *, clocks: Rows | None = None) -> Legs:
     """The legs of rows as `bridge.legs` describes them; samples whose command was never applied are left out.
 
-    offset_ns: the controller's clock less the emulator's, 0 on one machine; None where nobody knows, and with it no leg from
-    one end to the other.
+    clocks: where the ends have two, how they relate (CLOCK_COLUMNS); without a row nobody knows, and with it no leg from one
+    end to the other.
     """
     t_ns = np.intersect1d(np.intersect1d(ticks[:, 0], answers[:, 0]), samples[:, 0])
     tick = _columns(ticks, t_ns, TICK_COLUMNS)
     answer = _columns(answers, t_ns, ANSWER_COLUMNS)
     sample = _columns(samples, t_ns, SAMPLE_COLUMNS)
     sent, back = tick["sent_ns"], answer["kernel_ns"]
-    if offset_ns is None:
+    offset_ns, offset_error_ns = None, None
+    if clocks is not None and len(clocks):
+        offset_ns, offset_error_ns = offset_at(clocks, sent)
+    elif clocks is not None:
         sent, back = np.zeros_like(sent), np.zeros_like(back)
     route = (
         ("wake", tick["due_ns"], tick["woke_ns"]),
@@ -89,12 +99,12 @@ def legs_of(ticks: Rows, answers: Rows, samples: Rows, clock: Estimate | None, *
         known = (begun != 0) & (ended != 0)
         negative += int((known & (ended < begun)).sum())
         durations[name] = np.where(known, np.maximum(0, ended - begun), -1)
-    return Legs(t_ns, durations, answer["acts_ns"] - t_ns, clock, negative)
+    return Legs(t_ns, durations, answer["acts_ns"] - t_ns, clock, negative, offset_ns, offset_error_ns)
 
 
-def _shifted(stamps_ns: Rows, offset_ns: int | None) -> Rows:
+def _shifted(stamps_ns: Rows, offset_ns: Rows | None) -> Rows:
     """Stamps of the controller on the emulator's clock; those that are not known stay 0."""
-    return np.where(stamps_ns != 0, stamps_ns - (offset_ns or 0), 0)
+    return stamps_ns if offset_ns is None else np.where(stamps_ns != 0, stamps_ns - offset_ns, 0)
 
 
 def _columns(rows: Rows, t_ns: Rows, names: tuple[str, ...]) -> dict[str, npt.NDArray[np.int64]]:

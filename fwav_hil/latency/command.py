@@ -22,14 +22,15 @@ from bridge.command_line import (
     seed_option,
     wait_option,
 )
-from bridge.summary import is_stdout, read_json, show_json, write_json
-from protocol.errors import FwavHilError, Interrupted, PeerMissingError, UsageError
+from bridge.summary import is_stdout, make_folder, read_json, show_json, write_json
+from protocol.errors import FwavHilError, Interrupted, PeerMissingError, RunFolderError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rich.console import Console
 
+RESULT = "latency.json"
 FREE_PORT = "udpin://127.0.0.1:0"
 _ASKED_RATE_HZ, _ASKED_S = 50.0, 10.0
 _MOST_HZ, _MOST_QUESTIONS = 10_000.0, 10_000_000.0
@@ -39,7 +40,7 @@ Example:
   fwav-hil latency flapper --rate 500 --duration 60 --against
   fwav-hil latency flapper --rate 500 --delay 5ms --json delayed.json
   fwav-hil latency --link serial:///dev/ttyUSB0:921600 --rate 50      an autopilot, by TIMESYNC alone
-  fwav-hil latency --from RUN --controller-from RUN_OF_THE_OTHER_HOST
+  fwav-hil latency --from RUN --controller-from RUN_OF_THE_OTHER_HOST --out REPORT
 """
 
 
@@ -62,7 +63,8 @@ Example:
     ),
     click.option(
         "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
-        help="Folder of the run, its histograms (.hgrm) and the plot; by default a new one in runs/.",
+        help="Folder of the run, its histograms (.hgrm) and the plot; by default a new one in runs/. With --from: of "
+        "histograms and plot, instead of the run's own.",
     ),
     wait_option, json_option,
 )  # fmt: skip
@@ -73,16 +75,20 @@ def latency(
     out: Path | None, wait_s: float, json_path: Path | None,
 ) -> None:  # fmt: skip
     """Measure where the time goes between a sample and its command, in the real-time closed loop or on a real link."""
-    from rich.console import Console
+    from fwav_hil.tables import plain_console
 
     to_stderr = is_stdout(json_path)
     terminal = (sys.stderr if to_stderr else sys.stdout).isatty()
-    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr, width=None if terminal else 120)
+    console = plain_console(to_stderr=to_stderr, width=None if terminal else 120)
     if controller_folder and not folder:
         raise UsageError("--controller-from says where the other half of --from DIR is: give both")
     if folder:
-        _refuse_others(context, "with --from nothing is flown", ("folder", "controller_folder", "json_path"))
-        _report(folder, controller_folder, None, console, json_path)
+        _refuse_others(context, "with --from nothing is flown", ("folder", "controller_folder", "out", "json_path"))
+        if out:
+            if (out / RESULT).exists():
+                raise RunFolderError(f"{out} holds a latency report already, which stays: choose another with --out")
+            make_folder(out)
+        _report(folder, controller_folder, None, console, json_path, out=out)
         return
     if link.partition("://")[0] not in ("udpin", "tcpin"):
         _refuse_others(
@@ -134,9 +140,17 @@ def _refuse_others(context: click.Context, why: str, known: tuple[str, ...]) -> 
 
 
 def _report(
-    folder: Path, controller_folder: Path | None, found: dict[str, Any] | None, console: Console, json_path: Path | None
+    folder: Path,
+    controller_folder: Path | None,
+    found: dict[str, Any] | None,
+    console: Console,
+    json_path: Path | None,
+    *,
+    out: Path | None = None,
 ) -> None:
-    """Write and show what the time stamps in a run folder say, beside what else was found (None: when it was flown)."""
+    """Show what the time stamps in a run folder say, beside what else was found (None: when it was flown), and write it
+    to `out`, or beside them.
+    """
     from fwav_hil.latency.analysis import LEGS, join_legs
     from fwav_hil.latency.figures import draw
     from fwav_hil.latency.study import report_of, summary_of, write_files
@@ -148,15 +162,16 @@ def _report(
     scenario = load_scenario(folder / FILES["scenario"])
     report = report_of(scenario, summary_of(folder, controller_folder), legs, two_clocks=controller_folder is not None)
     if found is None:
-        found = read_json(folder / "latency.json").get("beside", {})
+        found = read_json(folder / RESULT).get("beside", {})
+    target = out or folder
     durations = {name: legs.known(name) for name in LEGS}
-    files = write_files(folder, durations)
+    files = write_files(target, durations)
     known = legs.durations_ns["age"] >= 0
     title = f"{scenario.name}, {scenario.law}, {scenario.rate_hz:g} Hz, real time: legs of the loop"
     series = (legs.t_ns[known] * 1e-9, "age of the sample in the applied command", legs.durations_ns["age"][known])
-    files["plot"] = str(draw(folder / "latency.png", title, durations, series))
+    files["plot"] = str(draw(target / "latency.png", title, durations, series))
     result = {"mode": "closed_loop", **report, "beside": found, "files": {**files, "run": str(folder)}}
-    write_json(folder / "latency.json", result)
+    write_json(target / RESULT, result)
     print_report(result, console)
     console.print(f"run folder: {folder}")
     show_json(json_path, result)

@@ -162,10 +162,12 @@ def report_of(scenario: Scenario, summary: dict[str, Any], legs: Legs, *, two_cl
 
 
 def _offset_of(legs: Legs) -> dict[str, Any] | None:
-    if legs.clock is None:
+    """How far the controller's clock is ahead at the first sample and at the last, and the largest bound of the error; us."""
+    if legs.clock is None or legs.offset_ns is None or legs.offset_error_ns is None or not len(legs.t_ns):
         return None
     return {
-        "offset_us": legs.clock.offset_ns / 1e3,
-        "bound_us": legs.clock.error_ns / 1e3,
+        "offset_us": float(legs.offset_ns[0]) / 1e3,
+        "offset_at_end_us": float(legs.offset_ns[-1]) / 1e3,
+        "bound_us": float(legs.offset_error_ns.max()) / 1e3,
         "answers": legs.clock.answers,
     }

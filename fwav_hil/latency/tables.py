@@ -36,8 +36,9 @@ def print_report(result: dict[str, Any], console: Console) -> None:
         )
     else:
         console.print(
-            f"TIMESYNC: the controller's clock is ahead by {sync['offset_us']:.1f} us, within {sync['bound_us']:.1f} us; "
-            "legs between the machines are that uncertain"
+            f"TIMESYNC: the controller's clock is ahead by {sync['offset_us']:.1f} us at the start and "
+            f"{sync['offset_at_end_us']:.1f} us at the end, within {sync['bound_us']:.1f} us; legs between the machines are "
+            "that uncertain"
         )
     if beside := result["beside"]:
         rows = {

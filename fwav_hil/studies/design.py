@@ -6,8 +6,9 @@ linear loop (`loop_model`), and no flight lost (`flight_check`), neither at the 
 The error of a set of gains is the geometric mean of the RMSE of the group's axes, over the whole flight and from 2 s on, over
 a few seeds of noise: so axes count alike, whatever their units, and so do start-up and steady flight. The optimiser is
 scipy's differential evolution over the logarithms of the gains, attitude first (it does not depend on position), position
-then. The scenario's own gains take part, so the result cannot do worse on the seeds of the search; and where they hold on this
-link, a cell (axis, whole flight or from 2 s on) that comes out worse than theirs is punished, so that no axis pays for another.
+then. The scenario's own gains take part (those of the group's first axis, held within the bounds of the search); and where
+they hold on this link, a cell (axis, whole flight or from 2 s on) that comes out worse than theirs is punished, so that no
+axis pays for another.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from bridge.command_line import json_option, law_option, options, rate_option
+from bridge.option_types import FiniteRange
 from bridge.summary import is_stdout, show_json
 from protocol.errors import RunFolderError
 from protocol.scenario import find_scenario, load_scenario, with_overrides
@@ -22,7 +23,7 @@ from protocol.scenario import find_scenario, load_scenario, with_overrides
     law_option,
     rate_option,
     click.option(
-        "--delay-s", type=click.FloatRange(min=0.0, max=1.0), metavar="S",
+        "--delay-s", type=FiniteRange(min=0.0, max=1.0), metavar="S",
         help="Total delay, sample to action, instead of the scenario's.",
     ),
     click.option(

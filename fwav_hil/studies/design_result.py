@@ -10,13 +10,12 @@ from typing import Any
 import msgspec
 import numpy as np
 import tomli_w
-from rich.console import Console
 from rich.table import Table
 
 from bridge.process import StopFlag
 from fwav_hil.studies.design import GROUPS, Comparison, Found, at_twice_the_delay, compare, flown_error, gains_of
 from fwav_hil.studies.margin import ChannelMargin, Verdict, judge, linear_margins
-from fwav_hil.tables import show_error
+from fwav_hil.tables import plain_console, show_error
 from protocol.messages import AXES
 from protocol.scenario import NANOSECONDS, Delay, Scenario
 
@@ -152,7 +151,7 @@ def show_cost(cost: float) -> str:
 
 def print_design(result: Design, *, to_stderr: bool = False) -> None:
     """Print gains, margins and errors, old and new."""
-    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr)
+    console = plain_console(to_stderr=to_stderr)
     start, designed = result.start, result.designed
     title = f"{start.name}, law {start.law}, {start.rate_hz:g} Hz, delay {1e3 * start.delay_ns / NANOSECONDS:g} ms"
     gains = Table("gains", title=title, title_justify="left")

@@ -35,7 +35,7 @@ class ChannelMargin(msgspec.Struct, frozen=True, kw_only=True):
 
     gain_ratio         g/b, the true input gain over the law's
     gain_range         g/b from where to where the loop is stable: the range around gain_ratio, or the nearest one; None: none
-    gain_margin        the smaller of the two below; under 1 where unstable
+    gain_margin        the smaller of the two below; under 1 where unstable; 0: no gain is stable
     gain_margin_up     by which factor the gain may grow; None: by any
     gain_margin_down   by which it may shrink; None: by any
     phase_margin_rad   smallest turn of the loop at a crossover that takes it to its border; negative where unstable
@@ -62,8 +62,10 @@ def channel_margin(channel: Channel, delay_s: float, gain: complex | None = None
     turn = gain / size if np.iscomplexobj(gain) else 1.0
     stable = channel.stable(gain, delay_s)
     interval = range_around(stable_gains(channel, delay_s, turn), size)
-    up = interval[1] / size if interval else None
-    down = size / interval[0] if interval and interval[0] > 0.0 else None
+    if interval:
+        up, down = interval[1] / size, size / interval[0] if interval[0] > 0.0 else None
+    else:
+        up = down = 0.0
     margins = crossovers(channel, gain, delay_s)
     crossover, phase = min(margins, key=lambda one: abs(one[1]), default=(None, None))
     most = largest_delay(channel, gain)

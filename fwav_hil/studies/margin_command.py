@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from bridge.command_line import json_option, law_option, options, rate_option, scenario_argument
+from bridge.option_types import FiniteRange
 from bridge.summary import is_stdout, make_folder, show_json, write_json
 from protocol.errors import RunFolderError
 from protocol.scenario import find_scenario, load_scenario, with_overrides
@@ -21,11 +22,11 @@ RESULT = "margin.json"
     law_option,
     rate_option,
     click.option(
-        "--gain-ratio", type=click.FloatRange(min=0.0, min_open=True), metavar="R",
+        "--gain-ratio", type=FiniteRange(min=0.0, min_open=True), metavar="R",
         help="True input gain over the law's, g/b, in every channel instead of the scenario's: its gears are scaled.",
     ),
     click.option(
-        "--n-filter", type=click.FloatRange(min=0.0, min_open=True), metavar="N",
+        "--n-filter", type=FiniteRange(min=0.0, min_open=True), metavar="N",
         help="Derivative pole N (1/s) in every channel instead of the scenario's.",
     ),
     click.option(

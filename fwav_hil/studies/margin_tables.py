@@ -9,13 +9,14 @@ from rich.table import Table
 
 from fwav_hil.studies.margin import ChannelMargin
 from fwav_hil.studies.margin_study import Study
+from fwav_hil.tables import plain_console
 from protocol.messages import AXES
 from protocol.scenario import NANOSECONDS
 
 
 def print_study(result: Study, *, to_stderr: bool = False) -> None:
     """Print all tables, and the verdict last."""
-    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr)
+    console = plain_console(to_stderr=to_stderr)
     scenario = result.scenario
     delay_s = scenario.delay_ns / NANOSECONDS
     console.print(_channel_table(result, delay_s))

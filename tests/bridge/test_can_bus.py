@@ -213,6 +213,21 @@ def test_bus_off_is_told_from_other_errors_and_mended(failing: _Failing) -> None
     assert bus.counters["can_reopened"] == 1
 
 
+def test_what_is_not_for_us_does_not_hold_up_the_end_of_a_wait(
+    failing: _Failing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stranger that says something all the time must not keep the emulator from its resends, or from Ctrl-C."""
+
+    def talk(timeout: float) -> can.Message:
+        failing.clock.advance_ns(min(round(timeout * 1e9), 4_000_000))
+        return can.Message(arbitration_id=5, is_fd=True, is_extended_id=False)
+
+    bus = CanBus("socketcan:can0", 1_000_000, failing.clock)
+    monkeypatch.setattr(failing, "recv", talk)
+    assert bus.recv(0.01) is None
+    assert failing.clock.now_ns() == 10_000_000
+
+
 def test_a_full_send_queue_loses_the_frame_and_not_the_bus(failing: _Failing, monkeypatch: pytest.MonkeyPatch) -> None:
     bus = CanBus("socketcan:can0", 1_000_000, failing.clock)
 

@@ -15,12 +15,14 @@ from pymavlink.dialects.v20 import common
 from bridge.can_bus import CanBus
 from bridge.can_tap import CanTap
 from bridge.clock import MonotonicClock, VirtualClock
-from bridge.link import Link, parse_link_uri
+from bridge.link import Link, open_link, parse_link_uri
 from bridge.memory import memory_pair
 from bridge.udp import UdpIn
 from plant_emulator.motor_process import MotorThread
 from protocol.can_frame import CanFrame
+from protocol.errors import LinkError
 from protocol.mavlink_codec import FrameReader, FrameWriter, layout
+from tests.contracts.link_contract import PATIENCE_S
 from tests.plant_emulator.test_motor import with_motor
 
 FRAMES = [
@@ -140,6 +142,37 @@ def test_a_station_that_left_is_no_matter(station: Station) -> None:
     station.link.close()
     station.tap.watch(0, FRAMES[0])
     assert station.tap.poll() == []
+
+
+@pytest.mark.parametrize("scheme", ["udp", "tcp"])
+def test_when_a_station_has_left_another_may_come(scheme: str) -> None:
+    """One that starts again has another port: it must not have to wait for the end of the run."""
+    clock = VirtualClock()
+    request = FrameWriter(250, 1).seal(COMMAND_LONG, COMMAND_LONG.pack_fields(command=32000, param1=1.0))
+    with open_link(f"{scheme}in://127.0.0.1:0") as link:
+        tap = CanTap(link, 191, clock)
+        for _ in range(2):
+            with open_link(link.uri.replace("in://", "out://")) as station:
+                station.send(request)
+                while not tap.forwarding:
+                    tap.poll()
+                assert station.recv(PATIENCE_S), "the acknowledgement"
+            clock.advance_ns(6_000_000_000)
+            tap.poll()
+        assert tap.counters["tap_requests"] == 2
+
+
+def test_a_station_that_takes_nothing_does_not_end_the_flight(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_data: bytes) -> None:
+        raise LinkError("tcpin://: took 0 of 40 bytes in 1 s")
+
+    station.forward(1)
+    station.tap.poll()
+    monkeypatch.setattr(station.near, "send", refuse)
+    station.tap.watch(0, FRAMES[0])
+    assert not station.tap.forwarding
 
 
 def test_dronecans_mavcan_driver_sees_the_drives_through_it() -> None:

@@ -229,3 +229,17 @@ def test_the_next_peer_may_come() -> None:
                 peer.send(word)
                 assert receive(delayed) == word
                 delayed.release_peer()
+
+
+def test_on_a_stream_the_next_peer_may_come_after_one_that_hung_up() -> None:
+    with open_link("tcpin://127.0.0.1:0") as server:
+        delayed = DelayedLink(server, MS, MonotonicClock())
+        for word in (b"first", b"second"):
+            with open_link(server.uri.replace("in://", "out://")) as client:
+                client.send(word)
+                assert receive(delayed) == word
+                client.send(b"never taken")
+            with pytest.raises(LinkClosedError):
+                for _ in range(3):
+                    receive(delayed)
+            delayed.release_peer()

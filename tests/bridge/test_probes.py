@@ -147,6 +147,24 @@ def test_however_late_it_is_every_question_is_asked() -> None:
     assert result.lost == 0
 
 
+def test_an_answer_stamped_before_its_question_is_not_a_lost_one() -> None:
+    """The kernel stamps with the wall clock, which may be set meanwhile."""
+
+    class SetBack(Answering):
+        def recv(self, timeout_s: float) -> bytes | None:
+            data = super().recv(timeout_s)
+            self.received_ns -= 3_600_000 * MS
+            return data
+
+    clock = VirtualClock(10**16)
+    result = probe(
+        SetBack(clock, lambda number: [(50 * US, number)]), clock, StopFlag(), period_ns=PERIOD_NS, count=5,
+        question=lambda number: number.to_bytes(8, "little"), answered=lambda data: [int.from_bytes(data, "little")],
+    )  # fmt: skip
+    assert result.lost == 0
+    assert result.from_due_ns.tolist() == result.from_sent_ns.tolist() == [0] * 5
+
+
 def test_no_question_is_no_result() -> None:
     result, link, _ = ask(lambda number: [], 0)
     assert len(result.from_due_ns) == result.lost == 0

@@ -17,7 +17,9 @@ from typing import Any
 import pytest
 
 import bridge
+from bridge.command_line import run_command
 from bridge.process import StopFlag, end_with_parent, report_json, sit_on_core
+from fwav_hil.cli import cli
 from protocol.errors import Interrupted
 
 ROOT = Path(str(bridge.__file__)).resolve().parent.parent
@@ -169,3 +171,33 @@ class TestReportJson:
             report_json(child)({"event": "started"})
             os.set_blocking(reading, False)  # a line still in a buffer is an error then, not a wait
             assert json.loads(parent.readline()) == {"event": "started"}
+
+
+@pytest.mark.parametrize(
+    ("command", "file"),
+    [
+        (["controller", "--link", "udpout://127.0.0.1:9", "--wait", "0.1"], "controller.json"),
+        (
+            ["controller", "--clock", "realtime", "--legs", "--link", "udpout://127.0.0.1:9", "--wait", "0.1"],
+            "legs_controller.npz",
+        ),
+        (["motor", "--can", "virtual:taken"], "motor.json"),
+    ],
+)
+def test_what_another_process_left_in_the_folder_stays(
+    command: list[str], file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The figures of a run alone on this machine: its other half may be on another."""
+    (tmp_path / file).write_text("before")
+    assert run_command(cli, "fwav-hil", [*command, "--out", str(tmp_path)]) == 6
+    assert f"{file} is there already, and stays" in capsys.readouterr().err
+    assert (tmp_path / file).read_text() == "before"
+
+
+def test_a_folder_that_cannot_be_made_is_said_before_anything_begins(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    for command in ("controller", "motor"):
+        assert run_command(cli, "fwav-hil", [command, "--out", str(tmp_path / "file" / "run")]) == 6
+        assert "cannot create the folder" in capsys.readouterr().err

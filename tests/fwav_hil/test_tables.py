@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import pytest
 
-from fwav_hil.tables import print_spread, print_summary, show_error
+from fwav_hil.tables import plain_console, print_spread, print_summary, show_error
 from protocol.messages import AXES
 
 DEGREE = math.pi / 180.0
@@ -146,3 +146,23 @@ class TestSpread:
         assert "RMSE from 2 s, median" in captured.err
         assert "RMSE from 2 s, worst" in captured.err
         assert rows(captured.err)["y"] == ["1.00 mm", "2.00 mm", "0.30 mm", "0.40 mm"]
+
+
+def test_what_a_user_named_is_shown_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    """rich would make a picture of `:b:`, leave out `[red]`, and fail on `[/x]`."""
+    counters = {"motor_outages": 0, "motor_recoveries": 0}
+    can = {
+        "protocol": "mit",
+        "uri": "virtual:b",
+        "bitrate": 1_000_000,
+        "measured_load_percent": {"1000000": 1.0},
+        "load_percent": {"1000000": 2.0},
+    }
+    shown = summary(scenario="[red]", can=can)
+    shown["counters"]["emulator"] = counters
+    print_summary(shown)
+    plain_console().print("run folder: runs/[/x]")
+    said = capsys.readouterr().out
+    assert "mit drives on virtual:b: 1 %" in said
+    assert "[red], law ude" in said
+    assert said.endswith("run folder: runs/[/x]\n")

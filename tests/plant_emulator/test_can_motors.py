@@ -266,10 +266,13 @@ def test_a_drive_that_lets_go_in_flight_is_enabled_again(rig: Callable[..., Rig]
     with MotorThread(one.scenario, "odrive", uri), CanBus(uri, 1_000_000) as station:
         one.motors.meet(10.0)
         one.tick()
+        cleared: list[int] = []
+        one.motors.watches.append(lambda _, frame: cleared.append(frame.can_id >> 5) if frame.data == b"\0" else None)
         station.send(CanFrame(21 << 5 | 0x02))  # an Estop from somebody else
         torques = [one.tick()[0] for _ in range(60)]
     assert one.counted()["motor_safe_ticks"] >= 1
     assert one.counted()["motor_enables"] >= 2
+    assert set(cleared) == {21}, "the others are left alone"
     assert min(torques) < 0.5 * torques[-1]  # without torque only the gear's width is left
 
 

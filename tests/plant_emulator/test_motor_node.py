@@ -177,6 +177,23 @@ def test_an_estop_stops_one_drive_until_it_is_cleared() -> None:
     assert all(bench.enabled())
 
 
+def test_a_drive_that_is_enabled_again_does_not_disturb_the_others(protocol: str) -> None:
+    """The emulator asks for it every tenth of a second while a drive is faulty: the healthy ones fly on meanwhile."""
+    undisturbed, bench = Bench(protocol, lag_s=0.004), Bench(protocol, lag_s=0.004)
+    for one in (undisturbed, bench):
+        one.enable()
+        for _ in range(4):
+            one.tick(0.25)
+    bench.node._latch(2, Fault.OVER_TEMPERATURE, "over_temperatures")
+    bench.say(bench.host.enable([2]))
+    for one in (undisturbed, bench):
+        one.tick(0.25)
+    others = [0, 1, 3, 4, 5]
+    assert bench.enabled() == [True] * 6
+    assert np.array_equal(bench.node.bank.state.u[others], undisturbed.node.bank.state.u[others])
+    assert bench.torques()[2] < 0.9 * undisturbed.torques()[2], "it begins at its safe value"
+
+
 def test_a_repeated_tick_moves_nothing_and_is_answered_alike() -> None:
     bench = Bench("odrive", lag_s=0.002)
     bench.enable()

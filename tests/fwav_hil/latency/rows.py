@@ -9,6 +9,7 @@ import numpy as np
 
 from bridge.legs import (
     ANSWER_COLUMNS,
+    CLOCK_COLUMNS,
     CONTROLLER_FILE,
     EMULATOR_FILE,
     SAMPLE_COLUMNS,
@@ -62,5 +63,9 @@ def stamps(count: int, *, offset_ns: int = 0, stamped: bool = True) -> Stamps:
 
 def save(stamped: Stamps, folder: Path, controller_folder: Path | None = None, clock: Estimate | None = None) -> None:
     """Write the files of a run."""
-    save_legs(folder / EMULATOR_FILE, {"ticks": stamped.ticks, "answers": stamped.answers}, clock)
+    clocks = LegTable(CLOCK_COLUMNS)
+    if clock:
+        clocks.add(START_NS, clock.offset_ns, clock.round_trip_ns)
+    tables = {"ticks": stamped.ticks, "answers": stamped.answers, "clocks": clocks}
+    save_legs(folder / EMULATOR_FILE, tables, clock)
     save_legs((controller_folder or folder) / CONTROLLER_FILE, {"samples": stamped.samples}, None)

@@ -19,6 +19,7 @@ from tests.fwav_hil.latency.rows import (
     DURATIONS_NS,
     LEGS_WITHIN_AGE,
     PERIOD_NS,
+    START_NS,
     Stamps,
     save,
     stamps,
@@ -28,8 +29,14 @@ COUNT = 50
 CROSSING = ("to_kernel", "back_to_kernel")
 
 
-def joined(stamped: Stamps, **options: int | None) -> Legs:
-    return legs_of(stamped.ticks.rows, stamped.answers.rows, stamped.samples.rows, None, **options)
+def joined(stamped: Stamps, clocks: list[tuple[int, int, int]] | None = None) -> Legs:
+    rows = None if clocks is None else np.array(clocks, dtype=np.int64).reshape(-1, 3)
+    return legs_of(stamped.ticks.rows, stamped.answers.rows, stamped.samples.rows, None, clocks=rows)
+
+
+def at_once(offset_ns: int) -> list[tuple[int, int, int]]:
+    """Clocks that one answer without delay relates."""
+    return [(START_NS, offset_ns, 0)]
 
 
 def assert_known(legs: Legs, names: tuple[str, ...] = tuple(DURATIONS_NS)) -> None:
@@ -49,15 +56,15 @@ def test_every_leg_comes_out_as_it_was() -> None:
 
 @given(st.integers(-(10**12), 10**12))
 def test_two_clocks_give_the_same_legs_as_one(offset_ns: int) -> None:
-    assert_known(joined(stamps(COUNT, offset_ns=offset_ns), offset_ns=offset_ns))
+    assert_known(joined(stamps(COUNT, offset_ns=offset_ns), at_once(offset_ns)))
 
 
 def test_a_clock_that_ran_before_zero_is_a_clock_too() -> None:
-    assert_known(joined(stamps(COUNT, offset_ns=-(10**14)), offset_ns=-(10**14)))
+    assert_known(joined(stamps(COUNT, offset_ns=-(10**14)), at_once(-(10**14))))
 
 
 def test_where_the_offset_is_not_known_the_crossing_legs_are_not() -> None:
-    legs = joined(stamps(COUNT, offset_ns=10**9), offset_ns=None)
+    legs = joined(stamps(COUNT, offset_ns=10**9), [])
     assert_known(legs, tuple(name for name in DURATIONS_NS if name not in CROSSING))
     assert all(len(legs.known(name)) == 0 for name in CROSSING)
     assert legs.negative == 0
@@ -73,7 +80,7 @@ def test_without_kernel_stamps_the_legs_to_and_from_the_kernel_are_not_known() -
 
 def test_a_leg_that_ended_before_it_began_counts_as_nothing_and_is_counted() -> None:
     wrong_ns = DURATIONS_NS["to_kernel"] + 10  # the controller seems to hear of the first ten samples before they left
-    legs = joined(stamps(COUNT), offset_ns=wrong_ns)
+    legs = joined(stamps(COUNT), at_once(wrong_ns))
     assert legs.negative == 10
     assert legs.durations_ns["to_kernel"].tolist() == [max(0, tick - 10) for tick in range(COUNT)]
 

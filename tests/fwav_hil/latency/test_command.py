@@ -176,8 +176,22 @@ class TestFromAFolder:
         assert latency("--from", folder, "--controller-from", other, "--json", tmp_path / "result.json") == 0
         result = json.loads((tmp_path / "result.json").read_text())
         assert result["legs_us"]["compute"]["count"] > 50
-        assert set(result["time_sync"]) == {"offset_us", "bound_us", "answers"}
+        assert set(result["time_sync"]) == {"offset_us", "offset_at_end_us", "bound_us", "answers"}
         assert "the controller's clock is ahead by" in capsys.readouterr().out
+
+    def test_the_report_may_go_elsewhere_and_leaves_the_run_as_it_was(
+        self, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """What the sentence about a folder that cannot be written to proposes."""
+        assert latency("--from", folder) == 0
+        before = {file.name: file.read_bytes() for file in folder.iterdir()}
+        out = tmp_path / "report"
+        assert latency("--from", folder, "--out", out) == 0
+        assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+        assert {file.name for file in out.iterdir()} == {"latency.json", "latency.png", "latency_age.hgrm"}
+        capsys.readouterr()
+        assert latency("--from", folder, "--out", out) == 6
+        assert_one_line(capsys.readouterr().err, "holds a latency report already")
 
     def test_known_stamps_come_out_as_they_are(self, folder: Path, tmp_path: Path) -> None:
         save(stamps(100), folder)
@@ -216,7 +230,6 @@ class TestWrongArguments:
             (["--from", ".", "--against"], ["--against would do nothing"]),
             (["--from", ".", "flapper"], ["SCENARIO would do nothing"]),
             (["--from", ".", "--delay", "5ms"], ["--delay would do nothing"]),
-            (["--from", ".", "--out", "elsewhere"], ["--out would do nothing"]),
             (["--link", "udpout://127.0.0.1:9", "--law", "pd"], ["--law would do nothing"]),
             (["--link", "udpout://127.0.0.1:9", "--delay", "1ms"], ["--delay would do nothing"]),
             (["--link", "udpout://127.0.0.1:9", "--rate", "0"], ["0 questions a second", "--rate"]),

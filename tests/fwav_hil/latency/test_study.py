@@ -130,8 +130,14 @@ class TestLosses:
 
 
 def synthetic(count: int) -> Legs:
+    return joined(count, None)
+
+
+def joined(count: int, clocks: list[tuple[int, int, int]] | None) -> Legs:
     rows = stamps(count)
-    return legs_of(rows.ticks.rows, rows.answers.rows, rows.samples.rows, Estimate(3_000, 10_000, 4))
+    two = None if clocks is None else np.array(clocks, dtype=np.int64).reshape(-1, 3)
+    clock = Estimate(3_000, 10_000, 4)
+    return legs_of(rows.ticks.rows, rows.answers.rows, rows.samples.rows, clock, clocks=two)
 
 
 def test_the_report_of_known_stamps() -> None:
@@ -150,12 +156,15 @@ def test_the_report_of_known_stamps() -> None:
 
 
 def test_with_two_clocks_there_is_nothing_to_check_timesync_by() -> None:
-    assert report_of(SCENARIO, FLOWN, synthetic(5), two_clocks=True)["time_sync"] == {
+    sent_ns = stamps(5).ticks.rows[:, 3].tolist()
+    answers = [(sent_ns[0], 3_000, 10_000), (sent_ns[-1], 4_000, 12_000)]
+    assert report_of(SCENARIO, FLOWN, joined(5, answers), two_clocks=True)["time_sync"] == {
         "offset_us": 3.0,
-        "bound_us": 5.0,
+        "offset_at_end_us": 4.0,
+        "bound_us": pytest.approx(5.0 + 1e-4 * (sent_ns[3] - sent_ns[0]) / 1e3, abs=1e-3),
         "answers": 4,
     }
-    assert report_of(SCENARIO, FLOWN, synthetic(5)._replace(clock=None), two_clocks=True)["time_sync"] is None
+    assert report_of(SCENARIO, FLOWN, joined(5, []), two_clocks=True)["time_sync"] is None
 
 
 def test_a_run_without_an_answer_has_a_report_too() -> None:

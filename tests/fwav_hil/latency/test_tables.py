@@ -55,8 +55,10 @@ def test_timesync_says_whether_it_held() -> None:
     sync = {"error_us": 9.0, "bound_us": 8.0, "answers": 12, "held": False}
     assert "BEYOND its bound" in shown(print_report, report(time_sync=sync))
     assert "no answer came" in shown(print_report, report(time_sync=None))
-    sync = {"offset_us": -5.5, "bound_us": 8.0, "answers": 12}
-    assert "ahead by -5.5 us, within 8.0 us" in shown(print_report, report(time_sync=sync))
+    sync = {"offset_us": -5.5, "offset_at_end_us": 900.0, "bound_us": 8.0, "answers": 12}
+    assert "ahead by -5.5 us at the start and 900.0 us at the end, within 8.0 us" in shown(
+        print_report, report(time_sync=sync)
+    )
 
 
 def test_negative_durations_are_not_hidden() -> None:

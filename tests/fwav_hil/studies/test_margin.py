@@ -66,6 +66,16 @@ class TestChannels:
         assert margin.phase_margin_rad is not None
         assert margin.phase_margin_rad < 0.0
 
+    def test_where_no_gain_is_stable_there_is_no_margin(self) -> None:
+        """Not "any", which is what a loop without a border has."""
+        scenario = at_rate(scenario_of("paper"), 20.0)
+        margin = channel_margin(channels(scenario)["x"], 0.5)
+        assert margin.gain_range is None
+        assert (margin.gain_margin_up, margin.gain_margin_down, margin.gain_margin) == (0.0, 0.0, 0.0)
+        row = rate_row(delayed(scenario, Delay(samples=10)), 20.0)
+        assert not row.stable
+        assert row.gain_margin == 0.0
+
     def test_a_pd_may_lose_any_gain(self) -> None:
         margin = linear_margins(scenario_of("flapper", law="pd"))["x"]
         assert margin.gain_range is not None
