@@ -118,8 +118,16 @@ def _take_priority(undo: contextlib.ExitStack) -> Setting:
     except OSError as error:
         limit, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
         return Setting(name, False, f"{error.strerror}: the limit rtprio is {limit}", SHELL_REMEDY)
-    undo.callback(os.sched_setscheduler, 0, *before)
+    undo.callback(_give_back_priority, *before)
     return Setting(name, True, "ahead of every ordinary process")
+
+
+def _give_back_priority(policy: int, parameters: os.sched_param) -> None:
+    """Be scheduled as before. Without CAP_SYS_NICE the flag that resets on fork cannot be taken back, and stays."""
+    try:
+        os.sched_setscheduler(0, policy, parameters)
+    except PermissionError:
+        os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, parameters)
 
 
 def _lock_memory(undo: contextlib.ExitStack) -> Setting:

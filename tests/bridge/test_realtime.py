@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import gc
 import os
 import resource
@@ -67,6 +68,24 @@ def test_an_error_inside_gives_everything_back_too() -> None:
     with pytest.raises(RuntimeError), real_time(None):
         raise RuntimeError
     assert state()[:5] == before[:5]
+
+
+def test_an_unprivileged_process_is_let_go_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a limit rtprio but no CAP_SYS_NICE the kernel grants SCHED_FIFO, and refuses to take back the reset on fork."""
+    policies = [os.SCHED_OTHER]
+
+    def set_scheduler(_pid: int, policy: int, _parameters: os.sched_param) -> None:
+        if policies[-1] & ~policy & os.SCHED_RESET_ON_FORK:
+            raise PermissionError(errno.EPERM, "Operation not permitted")
+        policies.append(policy)
+
+    monkeypatch.setattr(os, "sched_getscheduler", lambda _pid: policies[-1])
+    monkeypatch.setattr(os, "sched_setscheduler", set_scheduler)
+    for _ in range(2):
+        with real_time(None) as settings:
+            assert by_name(settings)["SCHED_FIFO"].granted
+            assert policies[-1] & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
+        assert policies[-1] & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
 
 
 def test_a_system_that_refuses_everything_is_quoted_with_remedies_and_nothing_breaks(
