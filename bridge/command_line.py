@@ -11,6 +11,7 @@ from typing import Any, ClassVar, TypeVar
 
 import click
 
+from bridge.option_types import FiniteRange
 from bridge.process import Report, StopFlag, end_with_parent, report_json, sit_on_core
 from protocol.errors import FwavHilError, Interrupted, RunFolderError
 from protocol.scenario import Scenario, find_scenario, load_scenario, with_overrides
@@ -47,7 +48,7 @@ clock_option = click.option(
     help="lockstep: simulation time waits for every answer, so the result is the same everywhere. realtime: wall time.",
 )  # fmt: skip
 wait_option = click.option(
-    "--wait", "wait_s", type=click.FloatRange(min=0.1), default=30.0, show_default=True, metavar="S",
+    "--wait", "wait_s", type=FiniteRange(min=0.1), default=30.0, show_default=True, metavar="S",
     help="How long to wait for the other end to appear.",
 )  # fmt: skip
 log_error_option = click.option(

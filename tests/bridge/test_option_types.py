@@ -35,6 +35,7 @@ def test_anything_else_is_refused(text: str) -> None:
         ("margin", "--n-filter"),
         ("design", "--out", "never.toml", "--delay-s"),
         ("run", "--speed"),
+        ("controller", "--wait"),
         ("emulator", "--wait", "0.1", "--link", "udpin://127.0.0.1:0", "--speed"),
     ],
 )
