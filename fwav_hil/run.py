@@ -89,12 +89,21 @@ def check_link(uri: str) -> None:
 
 
 def check_motors(scenario: Scenario, motors: MotorsOnCan) -> None:
-    """Raise UsageError or LinkUriError where the drives' bus cannot be what is asked for, before anything is started."""
+    """Raise UsageError, LinkUriError or RunFolderError where the drives' bus cannot be what is asked for.
+
+    Before anything is started, so that no folder is left behind.
+    """
     from bridge.can_bus import parse_can_uri
     from bridge.can_load import plan_bus
 
     parse_can_uri(motors.can)
     plan_bus(scenario.motor.protocol, scenario.motor, scenario.rate_hz)
+    if motors.tap:
+        parse_link_uri(motors.tap)
+    if motors.log:
+        from plant_emulator.can_recorder import check_record
+
+        check_record(motors.log)
 
 
 def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]:

@@ -19,10 +19,12 @@ SUFFIXES: Final = (".blf", ".log", ".asc", ".csv")
 CHANNEL: Final = "motors"
 
 
-def check_suffix(path: Path) -> None:
-    """Raise UsageError where python-can has no writer for the file's suffix."""
+def check_record(path: Path) -> None:
+    """Raise UsageError where python-can has no writer for the file's suffix, RunFolderError where the file is there."""
     if path.suffix.lower() not in SUFFIXES:
         raise UsageError(f"the bus cannot be recorded to {path}: choose a name that ends in {', '.join(SUFFIXES)}")
+    if path.exists():
+        raise RunFolderError(f"{path} exists already, and stays: choose another name for the record of the bus")
 
 
 class CanRecorder:
@@ -32,13 +34,11 @@ class CanRecorder:
     """
 
     def __init__(self, path: Path, tell: Callable[[str], None] | None = None) -> None:
-        check_suffix(path)
+        check_record(path)
         self.path = path
         self._tell = tell
         self._is_full = False
         self._owed: list[tuple[int, CanFrame]] = []
-        if path.exists():
-            raise RunFolderError(f"{path} exists already, and stays: choose another name for the record of the bus")
         try:
             self._writer: Any = can.Logger(path)
         except OSError as error:

@@ -354,7 +354,7 @@ class RealTime(Pacing):
     def _answered(self, t_ns: int, arrived_ns: int) -> None:
         """Take note of the newest command: that for the tick of t_ns."""
         self._newest_ns = t_ns
-        self._heard_ns = arrived_ns
+        self._heard_ns = self.clock.now_ns()  # not the stamp: the wall clock it was made of may have been set since
         sent_ns = self._sent.pop(t_ns)
         self.latencies_ns.append(arrived_ns - sent_ns)
         if len(self._sent) > 1:  # ticks that will not be answered any more
@@ -365,7 +365,7 @@ class RealTime(Pacing):
         self.owe_log(self._unix_us(wall_ns), [frame.raw])
         if (frame.system, frame.component) != VEHICLE:
             return
-        self._heard_ns = wall_ns
+        self._heard_ns = self.clock.now_ns()
         if frame.message_id == mavlink_map.TIMESYNC.message_id:
             answer = self.time_sync.take(frame, stamp_ns or wall_ns)
             if answer:

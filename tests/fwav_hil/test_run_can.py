@@ -157,3 +157,21 @@ def test_drives_alone_obey_a_controller_that_knows_only_the_published_dbc(tmp_pa
         _, errors = drives.communicate(timeout=PATIENCE_S)
     assert drives.returncode == 0, errors
     assert json.loads((tmp_path / "m.json").read_text())["counters"]["watchdog_trips"] == 1
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words", "code"),
+    [
+        ("--can-log", "bus.txt", "choose a name that ends in .blf", 2),
+        ("--can-log", "there.log", "there.log exists already, and stays", 6),
+        ("--tap", "carrier-pigeon://x", "carrier-pigeon", 2),
+    ],
+)
+def test_what_cannot_be_recorded_or_tapped_leaves_no_folder(
+    option: str, value: str, words: str, code: int, tmp_path: Path
+) -> None:
+    (tmp_path / "there.log").touch()
+    ended = call("run", "flapper", "--motor", "can", "--can", "virtual:a", option, value, "--out", "run", cwd=tmp_path)
+    assert_one_line(ended.stderr, words)
+    assert ended.returncode == code
+    assert not (tmp_path / "run").exists()
