@@ -15,7 +15,8 @@ from rich.progress import Progress as Bar
 
 from bridge.clock import Clock, PunctualClock, unix_time_us
 from bridge.link import NOBODY, Link
-from bridge.process import StopFlag, open_patiently
+from bridge.process import Report, StopFlag, open_patiently
+from bridge.realtime import Settings, maybe_real_time, own_core, report_settings
 from bridge.replay import Player, log_times_ns
 from bridge.summary import percentiles_us
 from fwav_hil.progress import StatusLine
@@ -26,28 +27,35 @@ from protocol.log_scan import Scan
 from protocol.retime import Signer, TimeMover, read_key
 
 _DRAIN_LIMIT = 100
+_DRAW_PERIOD_NS = 200_000_000
+_DRAW_ROOM_NS = 3_000_000
+"""Drawing the bar takes a millisecond or two: it waits for a moment when nothing is due, at most five periods."""
 
 
 class ReplayOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How a log is replayed. speed: of log time; None is as fast as it goes."""
+    """How a log is replayed. speed: of log time; None is as fast as it goes. realtime: with what `real_time` asks for."""
 
     speed: float | None = 1.0
     loop: bool = False
     max_gap_s: float | None = None
     rewrite_time: bool = False
     signing_key: Path | None = None
+    realtime: bool = False
     wait_s: float = 30.0
 
 
 def replay_to(
-    scan: Scan, chosen: npt.NDArray[np.bool_], uri: str, options: ReplayOptions, stop: StopFlag
+    scan: Scan, chosen: npt.NDArray[np.bool_], uri: str, options: ReplayOptions, report: Report, stop: StopFlag
 ) -> dict[str, Any]:
     """Replay the chosen frames; returns what was sent, and how punctually. Raises LinkError, PeerError, Interrupted."""
     key = read_key(options.signing_key) if options.signing_key else None
     with open_patiently(uri, options.wait_s, stop) as link:
-        clock = PunctualClock()
+        clock = PunctualClock(sleeps_half=options.realtime)
         _await_peer(link, options.wait_s, clock, stop)
-        return Replay(scan, chosen, link, options, clock, stop, key).run()
+        replay = Replay(scan, chosen, link, options, clock, stop, key)
+        with maybe_real_time(own_core(0), wanted=options.realtime) as settings:
+            report_settings(report, settings)
+            return replay.run(settings)
 
 
 def _await_peer(link: Link, wait_s: float, clock: Clock, stop: StopFlag) -> None:
@@ -95,11 +103,13 @@ class Replay:
         self._pass_us = int(times_ns[-1]) // 1000 + 1
         self.player = Player(times_ns, self._prepare, link.send, clock, speed=options.speed, look=self._attend)
         self._keyboard = Keyboard()
-        self._display = _Display(len(self._begins))
+        self._display = _Display(len(self._begins), clock)
 
-    def run(self) -> dict[str, Any]:
-        """Play it. Raises Interrupted where the user stopped it, PeerMissingError where nobody took anything."""
-        begun_ns = self._clock.now_ns()
+    def run(self, settings: Settings = ()) -> dict[str, Any]:
+        """Play it. Raises Interrupted where the user stopped it, PeerMissingError where nobody took anything.
+
+        settings: what came of asking for real time, for the result.
+        """
         with self._keyboard, self._display:
             if self._keyboard.active:
                 self._display.say(HELP)
@@ -108,9 +118,11 @@ class Replay:
                     f"{self._were_signed} frames carry the signatures of their day, which a receiver that checks them "
                     "refuses: sign anew with --signing-key FILE"
                 )
+            begun_ns = self._clock.now_ns()
             self.player.play(loop=self._options.loop)
+            wall_ns = self._clock.now_ns() - begun_ns
             self._attend(self.player)
-        result = self._result(self._clock.now_ns() - begun_ns)
+        result = self._result(wall_ns) | {"realtime": [msgspec.to_builtins(setting) for setting in settings]}
         if self._stop.requested:
             raise Interrupted(f"interrupted after {result['frames']} frames")
         stats = self._link.stats
@@ -163,13 +175,16 @@ class Replay:
 class _Display:
     """Log time in a bar on a terminal, a line now and then elsewhere."""
 
-    def __init__(self, frames: int) -> None:
+    def __init__(self, frames: int, clock: Clock) -> None:
         self._frames = frames
+        self._clock = clock
+        self._drawn_ns = clock.now_ns()
         self._line = StatusLine()
         self._bar: Bar | None = None
         if sys.stderr.isatty():
             columns = (TextColumn("replaying"), BarColumn(bar_width=30), TextColumn("{task.description}"))
-            self._bar = Bar(*columns, console=Console(stderr=True))
+            # Drawn by hand: the thread that would draw it holds the interpreter when a frame is due.
+            self._bar = Bar(*columns, console=Console(stderr=True), auto_refresh=False)
             self._task = self._bar.add_task("", total=frames)
 
     def say(self, text: str) -> None:
@@ -182,6 +197,10 @@ class _Display:
         )
         if self._bar:
             self._bar.update(self._task, completed=player.at, description=text)
+            since_ns = self._clock.now_ns() - self._drawn_ns
+            if since_ns > _DRAW_PERIOD_NS and (player.room_ns > _DRAW_ROOM_NS or since_ns > 5 * _DRAW_PERIOD_NS):
+                self._bar.refresh()
+                self._drawn_ns = self._clock.now_ns()
         else:
             self._line.show(text)
 
@@ -192,6 +211,7 @@ class _Display:
 
     def __exit__(self, *_: object) -> None:
         if self._bar:
+            self._bar.refresh()
             self._bar.stop()
 
 
