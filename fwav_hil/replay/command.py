@@ -123,17 +123,17 @@ def replay_command(
         return _replay_into(
             log, into, law=law, scenario=scenario, fast=fast, out=out, plots=plots, wait_s=wait_s, json_path=json_path
         )
-    from fwav_hil.replay.selection import Choice, choose, open_log, split_names
+    from fwav_hil.logs.choice import choose, choose_frames, open_telemetry
     from fwav_hil.replay.to_link import ReplayOptions, replay_to
 
     report, stop = begin_process("text", None, with_parent=False)
-    scan = open_log(log)
-    choice = Choice(begin=begin, end=ends[0] if ends else None, types=split_names(types), systems=split_names(systems))
+    opened, scan = open_telemetry(log)
+    chosen = choose_frames(opened, scan, choose(opened, types, systems, begin, ends[0] if ends else None))
     how = ReplayOptions(
         speed=speed, loop=loop, max_gap_s=max_gap_s, rewrite_time=rewrite_time, signing_key=signing_key,
         realtime=realtime, wait_s=wait_s,
     )  # fmt: skip
-    result = replay_to(scan, choose(scan, choice), uris[0], how, report, stop)
+    result = replay_to(scan, chosen, uris[0], how, report, stop)
     late = result["lateness_us"]
     shown = ", ".join(f"{name} {late[name]:.0f} us" for name in ("p50", "p99", "max") if late[name] is not None)
     click.echo(

@@ -41,19 +41,18 @@ def diff_command(
     \b
     Exit codes: 0 the same within the tolerances, 1 different; others as ever.
     """
+    from fwav_hil.logs.choice import held_names, names_in, open_telemetry
     from fwav_hil.replay.command import DIFFERENT
     from fwav_hil.replay.diff import compare_logs, parse_tolerances
-    from fwav_hil.replay.selection import Choice, choose, open_log, split_names
 
     allowed = parse_tolerances(tolerances)
-    names = tuple(name.upper() for name in split_names(types))
-    scans = open_log(first), open_log(second)
-    if names:
-        for scan in scans:
-            choose(scan, Choice(types=names))  # says so where a log has none of them
-    difference = compare_logs(*scans, allowed, names or None)
+    (one, first_scan), (two, second_scan) = open_telemetry(first), open_telemetry(second)
+    names = held_names(
+        types, {**dict.fromkeys(names_in(one)), **dict.fromkeys(names_in(two))}, f"{one.path} or {two.path}"
+    )
+    difference = compare_logs(first_scan, second_scan, allowed, names or None)
     _print(difference, to_stderr=is_stdout(json_path))
-    show_json(json_path, {"first": str(scans[0].path), "second": str(scans[1].path), **difference.as_dict()})
+    show_json(json_path, {"first": str(one.path), "second": str(two.path), **difference.as_dict()})
     return 0 if difference.is_same else DIFFERENT
 
 

@@ -19,9 +19,9 @@ from bridge.process import Report, StopFlag, open_patiently
 from bridge.realtime import Settings, maybe_real_time, own_core, report_settings
 from bridge.replay import Player, log_times_ns
 from bridge.summary import percentiles_us
+from fwav_hil.logs.choice import time_of_day
 from fwav_hil.progress import StatusLine
 from fwav_hil.replay.keyboard import HELP, Keyboard
-from fwav_hil.replay.selection import time_of_day
 from protocol.errors import Interrupted, PeerMissingError
 from protocol.log_scan import Scan
 from protocol.retime import Signer, TimeMover, read_key

@@ -104,6 +104,39 @@ def test_the_schema_says_types_and_units(flight_log: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["parquet", "csv", "mcap"])
+class TestChoice:
+    @pytest.mark.parametrize(
+        ("options", "counts"),
+        [
+            (("--types", "att_pos_mocap"), {"ATT_POS_MOCAP": COUNT}),
+            (("--system", "1/1"), {"HIL_ACTUATOR_CONTROLS": COUNT, "STATUSTEXT": 1}),
+            (("--from", "0.5", "--to", "0.9"), {"ATT_POS_MOCAP": 5, "HIL_ACTUATOR_CONTROLS": 5}),
+            (("--to", "22:13:20.2", "--system", "1/191"), {"ATT_POS_MOCAP": 3}),
+        ],
+    )
+    def test_a_part_of_a_log(
+        self, shell: Shell, flight_log: Path, kind: str, options: tuple[str, ...], counts: dict[str, int]
+    ) -> None:
+        ended = shell("export", flight_log, "--to", kind, *options, "--json", "-", "--out", "part")
+        assert ended.code == 0
+        assert json.loads(ended.out)["messages"] == counts
+
+    def test_a_part_without_a_message_is_an_error(
+        self, shell: Shell, flight_log: Path, tmp_path: Path, kind: str
+    ) -> None:
+        ended = shell("export", flight_log, "--to", kind, "--system", "9", "--out", "part")
+        assert (ended.code, ended.out) == (2, "")
+        assert "no frame of" in ended.err
+        assert not (tmp_path / "part").exists()
+
+    @pytest.mark.parametrize("more", [("--to", "1", "--to", "2"), ("--to", "csv")])
+    def test_said_twice_it_is_refused(self, shell: Shell, flight_log: Path, kind: str, more: tuple[str, ...]) -> None:
+        ended = shell("export", flight_log, "--to", kind, *more)
+        assert (ended.code, ended.out) == (2, "")
+        assert "say what to write once: --to parquet, csv, mcap" in ended.err
+
+
+@pytest.mark.parametrize("kind", ["parquet", "csv", "mcap"])
 class TestOutputs:
     def test_what_is_there_stays(self, shell: Shell, flight_log: Path, tmp_path: Path, kind: str) -> None:
         (tmp_path / "out").write_bytes(b"mine")

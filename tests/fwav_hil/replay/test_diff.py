@@ -190,8 +190,8 @@ class TestCommand:
         ("second", "arguments", "code", "words"),
         [
             ("nowhere.tlog", (), 2, "nowhere.tlog"),
-            ("text.tlog", (), 6, "is no telemetry log"),
-            ("run", ("--types", "GPS_RAW_INT"), 2, "no frame of"),
+            ("text.tlog", (), 6, "holds no message"),
+            ("run", ("--types", "GPS_RAW_INT"), 2, "holds no such message"),
             ("run", ("--tolerance", "what=ever"), 2, "--tolerance what=ever"),
         ],
     )

@@ -19,8 +19,9 @@ from pymavlink.dialects.v20 import common
 from bridge.clock import VirtualClock
 from bridge.memory import memory_pair
 from bridge.process import StopFlag
+from bridge.realtime import Setting
+from fwav_hil.logs.choice import Choice, choose_frames, open_telemetry
 from fwav_hil.replay.keyboard import Keyboard
-from fwav_hil.replay.selection import Choice, choose, open_log
 from fwav_hil.replay.to_link import Replay, ReplayOptions
 from protocol import mavlink_map
 from protocol.mavlink_codec import FrameReader
@@ -76,6 +77,8 @@ class TestOverALink:
             raise PermissionError(1, "Operation not permitted")
 
         monkeypatch.setattr(os, "sched_setscheduler", refuse)
+        unlocked = Setting("memory locked", granted=False, said="not of a whole test run")
+        monkeypatch.setattr("bridge.realtime._lock_memory", lambda _: unlocked)
         options = ("--from", "0.3", "--realtime", "--json", "-")
         assert fwav_hil("replay", run_folder, "--to", uri_of(listener), *options) == 0
         said = capsys.readouterr()
@@ -166,7 +169,8 @@ class TestTrouble:
             (("--to", "udpout://127.0.0.1:9", "--speed", "0.05"), "0.05 is no speed"),
             (("--to", "udpout://127.0.0.1:9", "--speed", "fast"), "fast is no speed"),
             (("--to", "udpout://127.0.0.1:9", "--from", "noon"), "--from noon is no time"),
-            (("--to", "udpout://127.0.0.1:9", "--from", "99"), "no frame of"),
+            (("--to", "udpout://127.0.0.1:9", "--from", "99"), "no time of"),
+            (("--to", "udpout://127.0.0.1:9", "--system", "9"), "no frame of"),
             (("--to", "carrier://pigeon"), "names no link"),
             (("--into", "controller", "--realtime"), "--realtime is about keeping the time of a log"),
             (("--to", "udpout://127.0.0.1:9", "--realtime", "--speed", "max"), "--realtime is about keeping the time"),
@@ -198,11 +202,11 @@ class TestTrouble:
 
 class TestLoop:
     def test_with_times_rewritten_they_never_run_back(self, run_folder: Path) -> None:
-        scan = open_log(run_folder)
+        log, scan = open_telemetry(run_folder)
         near, far = memory_pair()
         stop, clock, times = StopFlag(), VirtualClock(), list[int]()
         with near, far:
-            chosen = choose(scan, Choice(types=("HIL_SENSOR",)))
+            chosen = choose_frames(log, scan, Choice(names=["HIL_SENSOR"]))
             how = ReplayOptions(speed=10.0, loop=True, rewrite_time=True)
             replay = Replay(scan, chosen, near, how, clock, stop)
             play = replay.player.play
