@@ -12,8 +12,9 @@ from typing import Any
 from bridge.clock import MonotonicClock, unix_time_us
 from bridge.link import NOBODY, Link
 from bridge.process import StopFlag, open_patiently
-from bridge.recorder import Recorder, Tell, refuse_existing_log
+from bridge.recorder import Recorder, refuse_existing_log
 from bridge.sidecar import LinkOfLog
+from bridge.sidecar_log import Tell
 from fwav_hil.progress import StatusLine
 from protocol.mavlink_codec import FrameReader, layouts_by_id
 
