@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,7 +62,9 @@ def _print(difference: LogDifference, *, to_stderr: bool) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr)
+    stream = sys.stderr if to_stderr else sys.stdout
+    width = None if stream.isatty() else 120  # no name is cut off in a file
+    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr, width=width)
     beyond = sorted((f for f in difference.fields if f.beyond), key=lambda f: (f.first_s or 0.0, f.message, f.field))
     if beyond:
         table = Table("field", "sender")
@@ -82,4 +85,6 @@ def _print(difference: LogDifference, *, to_stderr: bool) -> None:
         words = "identical" if not changed else f"the same within the tolerances ({changed} fields differ by less)"
         console.print(f"{words}: {len(difference.fields)} fields, {pairs} values compared")
     else:
-        console.print(f"different: {len(beyond)} of {len(difference.fields)} fields")
+        alone = sum(difference.only_first.values()) + sum(difference.only_second.values())
+        partnerless = f", {alone} rows without a partner" if alone else ""
+        console.print(f"different: {len(beyond)} of {len(difference.fields)} fields{partnerless}")
