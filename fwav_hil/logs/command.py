@@ -133,6 +133,8 @@ def export_command(
         raise UsageError(f"say what to write once: --to {', '.join(SUFFIXES)} (and --to TIME for the end)")
     opened = open_with_progress(log)
     choice = choose(opened, types, systems, start, ends[0] if ends else None)
+    if choice.names and all(name.startswith("UNKNOWN_") for name in choice.names):
+        raise UsageError(f"nothing says what is in {', '.join(choice.names)}: `fwav-hil log dump` shows the bytes")
     if opened.scan is not None:
         choose_frames(opened, opened.scan, choice)  # says so where nothing is left
     result = export_log(opened, kinds[0], out or default_output(log, kinds[0]), choice)

@@ -15,6 +15,7 @@ from mcap.reader import make_reader
 from fwav_hil.logs import export
 from protocol.log_files import open_log
 from tests.fwav_hil.logs.conftest import COUNT, Shell, flight
+from tests.protocol.log_records import FOREIGN
 
 NAMES = ["ATT_POS_MOCAP", "HIL_ACTUATOR_CONTROLS", "STATUSTEXT"]
 
@@ -128,6 +129,11 @@ class TestChoice:
         assert (ended.code, ended.out) == (2, "")
         assert "no frame of" in ended.err
         assert not (tmp_path / "part").exists()
+
+    def test_what_nobody_knows_has_no_table(self, shell: Shell, mixed_log: Path, kind: str) -> None:
+        ended = shell("export", mixed_log, "--to", kind, "--types", f"UNKNOWN_{FOREIGN[0]}")
+        assert (ended.code, ended.out) == (2, "")
+        assert "nothing says what is in UNKNOWN_" in ended.err
 
     @pytest.mark.parametrize("more", [("--to", "1", "--to", "2"), ("--to", "csv")])
     def test_said_twice_it_is_refused(self, shell: Shell, flight_log: Path, kind: str, more: tuple[str, ...]) -> None:
