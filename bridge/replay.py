@@ -5,6 +5,7 @@ The schedule is absolute, so lateness never adds up: a frame is due at the start
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable
 
 import numpy as np
@@ -60,7 +61,7 @@ class Player:
         self.sent = 0
         self.passes = 0
         self.held = False
-        self.lateness_ns: list[int] = []
+        self.lateness_ns = array("q")
         self._times: list[int] = times_ns.tolist()
         self._prepare = prepare
         self._send = send

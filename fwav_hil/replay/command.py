@@ -8,7 +8,7 @@ import click
 
 from bridge.command_line import begin_process, json_option, law_option, options, realtime_option, wait_option
 from bridge.summary import is_stdout, show_json, write_json
-from protocol.errors import RunFolderError, UsageError
+from protocol.errors import Interrupted, RunFolderError, UsageError
 
 EXAMPLE = """
 \b
@@ -115,6 +115,14 @@ def replay_command(
         raise UsageError(
             "say where to replay once: --to URI (and --to TIME for the end), or --into controller|emulator"
         )
+    of_links = {
+        "--from": begin, "--to TIME": ends, "--speed": speed != 1.0, "--types": types, "--system": systems, "--loop": loop,
+        "--max-gap": max_gap_s is not None, "--rewrite-time": rewrite_time, "--signing-key": signing_key,
+    }  # fmt: skip
+    of_ends = {"--law": law, "--scenario": scenario, "--fast": fast, "--out": out, "--no-plots": not plots}
+    if misplaced := [name for name, given in (of_links if into else of_ends).items() if given]:
+        right, wrong = ("to a link (--to URI)", "--into") if into else ("--into controller|emulator", "to a link")
+        raise UsageError(f"{', '.join(misplaced)}: for replays {right}, of no effect {wrong}: leave it out")
     if realtime and (into or speed is None):
         raise UsageError(
             "--realtime is about keeping the time of a log on its way to a link: leave out --into, --speed max"
@@ -142,6 +150,8 @@ def replay_command(
         err=is_stdout(json_path),
     )
     show_json(json_path, result)
+    if result["interrupted"]:
+        raise Interrupted(f"interrupted after {result['frames']} frames")
     return 0
 
 

@@ -22,7 +22,7 @@ from bridge.summary import percentiles_us
 from fwav_hil.logs.choice import time_of_day
 from fwav_hil.progress import StatusLine
 from fwav_hil.replay.keyboard import HELP, Keyboard
-from protocol.errors import Interrupted, PeerMissingError
+from protocol.errors import PeerMissingError, UsageError
 from protocol.log_scan import Scan
 from protocol.retime import Signer, TimeMover, read_key
 
@@ -47,7 +47,9 @@ class ReplayOptions(msgspec.Struct, frozen=True, kw_only=True):
 def replay_to(
     scan: Scan, chosen: npt.NDArray[np.bool_], uri: str, options: ReplayOptions, report: Report, stop: StopFlag
 ) -> dict[str, Any]:
-    """Replay the chosen frames; returns what was sent, and how punctually. Raises LinkError, PeerError, Interrupted."""
+    """Replay the chosen frames; returns what was sent, and how punctually. Raises LinkError, PeerError and UsageError,
+    and Interrupted where the user stopped it before it began.
+    """
     key = read_key(options.signing_key) if options.signing_key else None
     with open_patiently(uri, options.wait_s, stop) as link:
         clock = PunctualClock(sleeps_half=options.realtime)
@@ -88,7 +90,9 @@ class Replay:
         key: bytes | None = None,
     ) -> None:
         self._scan = scan
-        self._data = scan.data.tobytes()
+        self._data = scan.data.data
+        # Of what the dialect does not know, or knows as another message, nothing may be changed.
+        self._known: list[bool] = ((scan.frames["known"] == 1) & (scan.frames["flags"] & 0xFE == 0))[chosen].tolist()
         self._begins: list[int] = scan.frames["offset"][chosen].tolist()
         self._ends: list[int] = scan.ends()[chosen].tolist()
         self._stamps_us = scan.frames["stamp_us"][chosen]
@@ -98,15 +102,19 @@ class Replay:
         self._stop = stop
         self._mover = TimeMover(scan, chosen, unix_time_us()) if options.rewrite_time else None
         self._signer = Signer(key) if key else None
+        self._not_signed = 0
+        self._told_of_refusal = False
         self._were_signed = int(np.count_nonzero(scan.frames["signed"][chosen]))
         times_ns = log_times_ns(self._stamps_us, options.max_gap_s)
+        if options.loop and options.speed and not times_ns[-1]:
+            raise UsageError("--loop: all frames chosen are of one moment, which has no length: choose more of the log")
         self._pass_us = int(times_ns[-1]) // 1000 + 1
         self.player = Player(times_ns, self._prepare, link.send, clock, speed=options.speed, look=self._attend)
         self._keyboard = Keyboard()
         self._display = _Display(len(self._begins), clock)
 
     def run(self, settings: Settings = ()) -> dict[str, Any]:
-        """Play it. Raises Interrupted where the user stopped it, PeerMissingError where nobody took anything.
+        """Play it; the result says whether the user stopped it. Raises PeerMissingError where nobody took anything.
 
         settings: what came of asking for real time, for the result.
         """
@@ -123,21 +131,25 @@ class Replay:
             wall_ns = self._clock.now_ns() - begun_ns
             self._attend(self.player)
         result = self._result(wall_ns) | {"realtime": [msgspec.to_builtins(setting) for setting in settings]}
-        if self._stop.requested:
-            raise Interrupted(f"interrupted after {result['frames']} frames")
-        stats = self._link.stats
-        if stats.refused + stats.send_failed > result["frames"] // 2:
+        if self._refused > result["frames"] // 2:
             raise PeerMissingError(
-                f"nobody listens at {self._link.uri} ({stats.refused + stats.send_failed} of {result['frames']} frames "
-                "were refused): start the receiver first, or correct the address"
+                f"nobody listens at {self._link.uri} ({self._refused} of {result['frames']} frames were refused): start the "
+                "receiver first, or correct the address"
             )
         return result
 
+    @property
+    def _refused(self) -> int:
+        return self._link.stats.refused + self._link.stats.send_failed
+
     def _prepare(self, number: int, passes: int) -> bytes:
-        frame = self._data[self._begins[number] : self._ends[number]]
-        if self._mover:
+        frame = bytes(self._data[self._begins[number] : self._ends[number]])
+        if self._mover and self._known[number]:
             frame = self._mover.move(frame, passes * self._pass_us)
-        return self._signer.sign(frame, unix_time_us()) if self._signer else frame
+        if self._signer and self._known[number]:
+            return self._signer.sign(frame, unix_time_us())
+        self._not_signed += self._signer is not None
+        return frame
 
     def _attend(self, player: Player) -> None:
         """Look after all but the frames: the wish to stop, keys, what the receiver says, the display."""
@@ -148,6 +160,9 @@ class Replay:
         for _ in range(_DRAIN_LIMIT):
             if not self._link.recv(0.0):
                 break
+        if self._refused and not self._told_of_refusal:
+            self._told_of_refusal = True
+            self._display.say(f"nobody listens at {self._link.uri}, or not always: frames are refused")
         self._display.show(player, self._stamps_us)
 
     def _result(self, wall_ns: int) -> dict[str, Any]:
@@ -155,6 +170,7 @@ class Replay:
         log_s = player.passes * span_s + (player.log_ns * 1e-9 if player.at < len(self._begins) else 0.0)
         return {
             "log": str(self._scan.path),
+            "interrupted": self._stop.requested,
             "to": self._link.uri,
             "frames": player.sent,
             "passes": player.passes,
@@ -166,7 +182,7 @@ class Replay:
             "counters": {
                 "times_moved": self._mover.moved if self._mover else 0,
                 "signed": self._signer.signed if self._signer else 0,
-                "not_signed": self._signer.unsigned if self._signer else 0,
+                "not_signed": self._not_signed + (self._signer.unsigned if self._signer else 0),
                 **self._link.stats.as_dict(),
             },
         }

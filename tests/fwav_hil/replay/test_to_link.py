@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pymavlink.dialects.v20 import common
+from pymavlink.dialects.v20 import common, matrixpilot
 
 from bridge.clock import VirtualClock
 from bridge.memory import memory_pair
@@ -27,6 +27,7 @@ from protocol import mavlink_map
 from protocol.mavlink_codec import FrameReader
 from protocol.tlog import read_tlog
 from tests.fwav_hil.replay.conftest import Command
+from tests.protocol.log_records import CLASHING, FOREIGN, Pen
 
 KEY = bytes(range(32))
 
@@ -136,6 +137,23 @@ class TestOverALink:
         assert bytes(arrived) == b"".join(frames_of(run_folder))
 
 
+class TestOtherDialects:
+    def test_frames_of_unknown_or_clashing_messages_are_never_changed(self, tmp_path: Path) -> None:
+        """Their checksum's seed, and where a time would be, is not what our dialect says of that number."""
+        pen, foreign = Pen(), Pen(matrixpilot)
+        records = [pen.record(30) if n % 3 else foreign.record((*FOREIGN, CLASHING)[n // 3 % 3]) for n in range(90)]
+        (tmp_path / "a.tlog").write_bytes(b"".join(record.data for record in records))
+        log, scan = open_telemetry(tmp_path / "a.tlog")
+        near, far = memory_pair()
+        how = ReplayOptions(speed=None, rewrite_time=True)
+        with near, far:
+            replay = Replay(scan, choose_frames(log, scan, Choice()), near, how, VirtualClock(), StopFlag(), KEY)
+            counters = replay.run()["counters"]
+            sent = [far.recv(0.0) for _ in records]
+        assert [sent[n] for n in range(0, 90, 3)] == [records[n].frame for n in range(0, 90, 3)]
+        assert (counters["signed"], counters["not_signed"]) == (60, 30)
+
+
 class TestTrouble:
     def test_nobody_listening_is_told(
         self, fwav_hil: Command, run_folder: Path, capsys: pytest.CaptureFixture[str]
@@ -172,6 +190,9 @@ class TestTrouble:
             (("--to", "udpout://127.0.0.1:9", "--from", "99"), "no time of"),
             (("--to", "udpout://127.0.0.1:9", "--system", "9"), "no frame of"),
             (("--to", "carrier://pigeon"), "names no link"),
+            (("--into", "controller", "--from", "2", "--loop"), "--from, --loop: for replays to a link (--to URI)"),
+            (("--to", "udpout://127.0.0.1:9", "--fast", "--law", "pd"), "--law, --fast: for replays --into"),
+            (("--to", "udpout://127.0.0.1:9", "--from", "0.4", "--types", "HEARTBEAT", "--loop"), "--loop: all frames"),
             (("--into", "controller", "--realtime"), "--realtime is about keeping the time of a log"),
             (("--to", "udpout://127.0.0.1:9", "--realtime", "--speed", "max"), "--realtime is about keeping the time"),
             (("--to", "udpout://127.0.0.1:9", "--signing-key", "nowhere"), "cannot read the signing key nowhere"),
@@ -194,8 +215,12 @@ class TestTrouble:
         self, fwav_hil: Command, run_folder: Path, listener: socket.socket, capsys: pytest.CaptureFixture[str]
     ) -> None:
         threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
-        assert fwav_hil("replay", run_folder, "--to", uri_of(listener), "--loop") == 130
-        assert "interrupted after" in capsys.readouterr().err
+        assert fwav_hil("replay", run_folder, "--to", uri_of(listener), "--loop", "--json", "-") == 130
+        said = capsys.readouterr()
+        assert "interrupted after" in said.err
+        result = json.loads(said.out)  # what was measured is told all the same
+        assert result["interrupted"] is True
+        assert result["lateness_us"]["p99"] is not None
         whole = set(frames_of(run_folder))
         assert all(frame in whole for frame in received(listener))
 
@@ -249,6 +274,9 @@ class TestKeyboard:
             (b"x\x1b[Z ", ["hold"]),
             (b"\x1b[", []),
             (b"Bq", ["seek -60.0", "stop"]),
+            (b"\x1bOC\x1bOA", ["seek 5.0", "seek 60.0"]),
+            (b"\x1b", []),  # escape alone means nothing, and takes nothing with it
+            (b"q\x1bn", ["stop", "step"]),
         ):
             os.write(ours, keys)
             for _ in range(200):
