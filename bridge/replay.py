@@ -43,6 +43,7 @@ class Player:
 
     at         the frame that is due next             sent        how many have gone
     passes     whole passes done                      lateness_ns of each frame sent by schedule
+    moved      whether it was held, stepped or sought: its speed then says nothing
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class Player:
         self.at = 0
         self.sent = 0
         self.passes = 0
-        self.held = False
+        self.held = self.moved = False
         self.lateness_ns = array("q")
         self._times: list[int] = times_ns.tolist()
         self._prepare = prepare
@@ -133,17 +134,18 @@ class Player:
 
     def hold(self) -> None:
         """Pause, or go on from where it stands."""
-        self.held = not self.held
+        self.held, self.moved = not self.held, True
         self._steps = 0
         self._anchor()
 
     def step(self) -> None:
         """Send one frame and stay held."""
-        self.held = True
+        self.held = self.moved = True
         self._steps += 1
 
     def seek(self, by_s: float) -> None:
         """Move by so much log time, within the log; what lies between is not sent."""
+        self.moved = True
         here_ns = self._times[min(self.at, len(self._times) - 1)]
         self.at = int(np.searchsorted(self.times_ns, here_ns + round(by_s * 1e9)))
         self.at = min(self.at, len(self._times) - 1)

@@ -146,6 +146,7 @@ def replay_command(
     shown = ", ".join(f"{name} {late[name]:.0f} us" for name in ("p50", "p99", "max") if late[name] is not None)
     click.echo(
         f"{result['frames']} frames, {result['log_s']:.1f} s of log in {result['wall_s']:.1f} s"
+        + (f" ({result['speed_measured']:.4g} x)" if result["speed_measured"] else "")
         + (f", late by {shown}" if shown else ""),
         err=is_stdout(json_path),
     )

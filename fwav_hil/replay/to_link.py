@@ -177,7 +177,7 @@ class Replay:
             "log_s": log_s,
             "wall_s": wall_ns * 1e-9,
             "speed": self._options.speed,
-            "speed_measured": log_s / (wall_ns * 1e-9) if wall_ns else None,
+            "speed_measured": log_s / (wall_ns * 1e-9) if wall_ns and not player.moved else None,
             "lateness_us": percentiles_us(player.lateness_ns),
             "counters": {
                 "times_moved": self._mover.moved if self._mover else 0,

@@ -184,6 +184,17 @@ class TestHand:
         assert numbers == [*range(6), *range(expected, 100)]
         assert stage.times_ns()[6] == LOOK_PERIOD_NS, "at once"
 
+    @pytest.mark.parametrize("move", [lambda p: p.seek(0.1), lambda p: p.hold(), lambda p: p.step()])
+    def test_it_says_that_it_was_moved(self, move: Callable[[Player], None]) -> None:
+        def look(player: Player) -> None:
+            move(player)
+            player.stop()
+
+        untouched, touched = Stage(), Stage(look=look)
+        for stage in (untouched, touched):
+            stage.player.play()
+        assert (untouched.player.moved, touched.player.moved) == (False, True)
+
     def test_it_stops_before_the_next_frame(self) -> None:
         stage = Stage(look=lambda player: player.stop() if player.sent else None)
         stage.player.play(loop=True)

@@ -68,6 +68,7 @@ class TestOverALink:
         assert result["frames"] == len(frames_of(run_folder))
         assert result["log_s"] == pytest.approx(0.4)
         assert result["wall_s"] >= 0.4
+        assert 0 < result["speed_measured"] <= 1.0
         assert result["lateness_us"]["p50"] is not None
 
     def test_in_real_time_what_the_system_refuses_is_said(
