@@ -42,13 +42,13 @@ class Listener:
         """Listen until told to end. Raises LinkError, and RunFolderError where the recorder does."""
         while not self.ending:
             data = self.link.recv(LOOK_PERIOD_S)
-            if not data:
+            t_us = unix_time_us()
+            if data is None:
                 self._recorder.flush()  # tells, where the disk refuses
                 continue
-            t_us = unix_time_us()
             self.peers.add(self.link.peer)
             if self.link.is_datagram:
-                self.link.release_peer()  # whoever else sends here is recorded too
+                self.link.release_peer()  # whoever else sends here is recorded too, an empty datagram or not
             for frame in self._reader.read(data):
                 self._recorder.write(t_us, frame.raw, self.number)
                 self.kinds[frame.message_id] += 1
