@@ -28,7 +28,7 @@ def wake_up_lateness(seconds: float) -> dict[str, dict[str, Any]]:
     core = own_core(0)
     turns = []
     for _ in range(ALTERNATIONS):
-        theirs = _cyclictest(seconds, core or 0)
+        theirs = cyclictest(seconds, core or 0, RATE_HZ)
         trial, settings = try_wake_ups(MonotonicClock(), RATE_HZ, seconds, core, realtime=True)
         late = trial.lateness_us
         missed = sum(late["late_by"][name] for name in ("2000", "5000", "10000", "more"))
@@ -46,9 +46,9 @@ def wake_up_lateness(seconds: float) -> dict[str, dict[str, Any]]:
     }
 
 
-def _cyclictest(seconds: float, core: int) -> tuple[float, int]:
-    """p99 (us) and how many wake-ups were more than 1 ms late."""
-    command = ["cyclictest", "-q", "-m", "-t1", f"-a{core}", f"-p{PRIORITY}", f"-i{1e6 / RATE_HZ:.0f}"]
+def cyclictest(seconds: float, core: int, rate_hz: float) -> tuple[float, int]:
+    """p99 (us) of cyclictest's wake-ups, and how many were more than 1 ms late."""
+    command = ["cyclictest", "-q", "-m", "-t1", f"-a{core}", f"-p{PRIORITY}", f"-i{1e6 / rate_hz:.0f}"]
     command += ["-h20000", f"-D{max(1, round(seconds))}"]
     said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     counts = {int(late): int(count) for late, count in re.findall(r"^(\d{6}) (\d+)$", said, re.MULTILINE)}

@@ -56,15 +56,22 @@ class PunctualClock(MonotonicClock):
 
     How early follows from how late the machine's sleeps have lately been: some 100 us on a quiet machine, up to 20 ms on a
     shared virtual one, where frames that come that densely then keep a core busy.
+
+    sleeps_half   sleep through half of each wait at least. For a real-time thread: the kernel stops one that never lets go
+                  of its core, for 50 ms of each second (sched(7), sched_rt_runtime_us).
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, sleeps_half: bool = False) -> None:
         self._early_ns = LEAST_EARLY_NS
+        self._sleeps_half = sleeps_half
 
     def sleep_until_ns(self, t_ns: int) -> None:
         """Sleep, then poll; returns within some microseconds of t_ns where the machine runs this process at all."""
+        now_ns = time.monotonic_ns()
         wake_ns = t_ns - self._early_ns
-        if wake_ns > time.monotonic_ns():
+        if self._sleeps_half and t_ns - now_ns > LEAST_EARLY_NS:
+            wake_ns = max(wake_ns, (now_ns + t_ns) // 2)
+        if wake_ns > now_ns:
             super().sleep_until_ns(wake_ns)
             late_ns = time.monotonic_ns() - wake_ns
             slowly_less_ns = self._early_ns - self._early_ns // 256

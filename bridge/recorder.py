@@ -12,13 +12,12 @@ import os
 import struct
 import threading
 from collections import deque
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from bridge.sidecar import INDEX_ENTRY, LinkOfLog, index_path, new_sidecar, sidecar_path, write_sidecar
+from bridge.sidecar import INDEX_ENTRY, LinkOfLog, index_path, sidecar_path
+from bridge.sidecar_log import SidecarLog, Tell
 from protocol.errors import RunFolderError
-from protocol.tlog import TlogWriter
 
 FLUSH_PERIOD_S: Final = 0.04
 QUEUE_LIMIT: Final = 500_000
@@ -27,17 +26,13 @@ PENDING_LIMIT_BYTES: Final = 64 << 20
 """What may wait for a disk that refuses; further frames are lost, and counted."""
 
 _STAMP = struct.Struct(">Q")
-Tell = Callable[[str], None]
 
 
-class Recorder(TlogWriter):
+class Recorder(SidecarLog):
     """A log that is written behind the back of the loop, with its sidecar.
 
     Where the disk refuses, `tell` hears one sentence about it, at the next `write`; the recorder goes on, tries again every
     40 ms, and counts as lost what it cannot keep in the end. Without `tell` the sentence is raised as RunFolderError, once.
-
-    sidecar   what the sidecar will hold; a caller may add to its "counters" until `close`
-    lost      frames that will not be in the log
     """
 
     def __init__(
@@ -50,11 +45,7 @@ class Recorder(TlogWriter):
         tell: Tell | None = None,
     ) -> None:
         """Begin the log with its sidecar; see `new_sidecar`. Raises RunFolderError where that is not possible."""
-        super().__init__(path)
-        self.sidecar = new_sidecar(path, links, stamps=stamps, source=source)
-        self.lost = 0
-        self._tell = tell
-        self._told = False
+        super().__init__(path, links, stamps=stamps, source=source, tell=tell)
         self._news = ""
         self._queue: deque[tuple[int, bytes]] = deque()
         self._ends: deque[int] = deque()  # of the records on their way to the disk, as places in the log
@@ -62,16 +53,9 @@ class Recorder(TlogWriter):
         self._link = -1
         self._index = None
         self._index_pending = bytearray()
-        try:
+        with self._beginning():
             if len(links) > 1:
                 self._index = index_path(path).open("wb", buffering=0)
-            write_sidecar(path, self.sidecar)
-        except (OSError, RunFolderError) as error:
-            self._file.close()
-            with contextlib.suppress(OSError):
-                path.unlink()  # empty, and without its sidecar: no log
-            reason = error.strerror if isinstance(error, OSError) else str(error)
-            raise RunFolderError(f"cannot write beside the log {path}: {reason}") from None
         self._lock = threading.Lock()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"recorder of {path.name}", daemon=True)
@@ -80,7 +64,7 @@ class Recorder(TlogWriter):
     def write(self, t_us: int, frame: bytes, link: int = 0) -> None:
         """Record one frame of a link; never waits for the disk. May be called from several threads."""
         if self._news:
-            self._say()
+            self._say_news()
         if len(self._queue) < QUEUE_LIMIT:
             self._queue.append((link, _STAMP.pack(t_us) + frame))
         else:
@@ -90,7 +74,7 @@ class Recorder(TlogWriter):
     def flush(self) -> None:
         """Nothing a loop would have to wait for: only what the disk refused meanwhile is told."""
         if self._news:
-            self._say()
+            self._say_news()
 
     def close(self) -> None:
         """Write the rest, and have the sidecar say how the log ended; may be called again.
@@ -109,18 +93,7 @@ class Recorder(TlogWriter):
         self._file.close()
         if self._index:
             self._index.close()
-        self.sidecar |= {
-            "complete": self.lost == 0,
-            "frames": self._frames - len(self._ends),
-            "bytes": self._whole_bytes,
-            "lost": self.lost,
-        }
-        try:
-            write_sidecar(self.path, self.sidecar)
-        except RunFolderError as error:
-            self._news = self._news or str(error)
-        if self._news:
-            self._say()
+        self._end(self._news, frames=self._frames - len(self._ends), bytes=self._whole_bytes)
 
     def _run(self) -> None:
         while not self._ending.wait(FLUSH_PERIOD_S):
@@ -161,19 +134,14 @@ class Recorder(TlogWriter):
         except OSError as error:
             raise RunFolderError(f"cannot write the links of the log {self.path}: {error.strerror}") from None
 
-    def _say(self) -> None:
-        """Tell what the disk refused, the first time."""
+    def _say_news(self) -> None:
+        """Tell what the disk refused meanwhile."""
         sentence, self._news = self._news, ""
-        if self._told:
-            return
-        self._told = True
-        if self._tell is None:
-            raise RunFolderError(sentence)
-        self._tell(sentence)
+        self._say(sentence)
 
 
 def refuse_existing_log(path: Path) -> None:
-    """Raise RunFolderError where a log or its sidecar is there already: nothing recorded is overwritten."""
-    for taken in (path, sidecar_path(path)):
+    """Raise RunFolderError where a log, its sidecar or its index is there already: nothing recorded is overwritten."""
+    for taken in (path, sidecar_path(path), index_path(path)):
         if taken.exists():
             raise RunFolderError(f"{taken} is there already, which stays: choose another file with --out, or remove it")

@@ -15,12 +15,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from bridge.clock import Clock, MonotonicClock
-from bridge.recorder import Tell
 from bridge.ring import ByteRing
-from bridge.sidecar import LinkOfLog, new_sidecar, write_sidecar
-from protocol.errors import RunFolderError
+from bridge.sidecar import LinkOfLog
+from bridge.sidecar_log import SidecarLog, Tell
 from protocol.log_scan import scan_tlog
-from protocol.tlog import TlogWriter
 
 CAPACITY_BYTES: Final = 16 << 20
 """Over a minute of a 1 kHz loop: so long a disk may stall before a frame is lost."""
@@ -28,14 +26,12 @@ _PATIENCE_S: Final = 30.0
 _LOOK_NS: Final = 1_000_000
 
 
-class RingRecorder(TlogWriter):
+class RingRecorder(SidecarLog):
     """A log of one link, written by another process, with its sidecar.
 
     Where the disk refuses, `tell` hears one sentence about it at the next `flush`, and the writer tries again as long as the
     ring has room; without `tell` the sentence is raised as RunFolderError, once.
 
-    sidecar     what the sidecar will hold; a caller may add to its "counters" until `close`
-    lost        frames that are not, or will not be, in the log
     restarts    writers that died and were replaced
     may_wait    whether `hand_over` waits for room (lockstep) or counts frames as lost (real time)
     """
@@ -53,26 +49,14 @@ class RingRecorder(TlogWriter):
         clock: Clock | None = None,
     ) -> None:
         """Begin the log with its sidecar; see `new_sidecar`. Raises RunFolderError where that is not possible."""
-        super().__init__(path)
-        self.sidecar = new_sidecar(path, (link,), stamps=stamps, source=source)
-        self.lost = self.restarts = 0
-        self.deepest_bytes = 0
+        super().__init__(path, (link,), stamps=stamps, source=source, tell=tell)
+        self.restarts = self.deepest_bytes = 0
         self._may_wait = may_wait
-        self._tell = tell
-        self._told = False
         self._clock = clock or MonotonicClock()
         self._handed_over = self._pending_frames = 0
-        try:
-            write_sidecar(path, self.sidecar)
+        with self._beginning():
             self.ring = ByteRing.create(capacity)
             self._writer = self._start()
-        except (OSError, RunFolderError) as error:
-            self._file.close()
-            with contextlib.suppress(OSError):
-                path.unlink()  # empty: no log
-            if isinstance(error, RunFolderError):
-                raise
-            raise RunFolderError(f"cannot begin the log {path}: {error.strerror}") from None
 
     def _start(self) -> subprocess.Popen[bytes]:
         descriptors = (self.ring.descriptor, self._file.fileno())
@@ -154,21 +138,14 @@ class RingRecorder(TlogWriter):
         if os.fstat(self._file.fileno()).st_size < self.ring.put_bytes:
             self._cut_off()
         self._file.close()
-        self.sidecar |= {
-            "complete": self.lost == 0,
-            "frames": self._handed_over,
-            "bytes": self.path.stat().st_size,
-            "lost": self.lost,
-            "error": problem or None,
-            "writer": {"restarts": self.restarts, "deepest_bytes": self.deepest_bytes},
-        }
         self.ring.close()
-        try:
-            write_sidecar(self.path, self.sidecar)
-        except RunFolderError as error:
-            problem = problem or str(error)
-        if problem:
-            self._say(problem)
+        self._end(
+            problem,
+            frames=self._handed_over,
+            bytes=self.path.stat().st_size,
+            error=problem or None,
+            writer={"restarts": self.restarts, "deepest_bytes": self.deepest_bytes},
+        )
 
     def _end_input(self) -> None:
         """Close the writer's standard input: it then writes the rest and ends, if it still runs."""
@@ -183,12 +160,3 @@ class RingRecorder(TlogWriter):
             os.ftruncate(self._file.fileno(), whole)
         self.lost += self._handed_over - len(frames)
         self._handed_over = len(frames)
-
-    def _say(self, sentence: str) -> None:
-        """Tell what the disk refused, the first time."""
-        if self._told:
-            return
-        self._told = True
-        if self._tell is None:
-            raise RunFolderError(sentence)
-        self._tell(sentence)

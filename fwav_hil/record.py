@@ -12,8 +12,9 @@ from typing import Any
 from bridge.clock import MonotonicClock, unix_time_us
 from bridge.link import NOBODY, Link
 from bridge.process import StopFlag, open_patiently
-from bridge.recorder import Recorder, Tell, refuse_existing_log
+from bridge.recorder import Recorder, refuse_existing_log
 from bridge.sidecar import LinkOfLog
+from bridge.sidecar_log import Tell
 from fwav_hil.progress import StatusLine
 from protocol.mavlink_codec import FrameReader, layouts_by_id
 
@@ -41,13 +42,13 @@ class Listener:
         """Listen until told to end. Raises LinkError, and RunFolderError where the recorder does."""
         while not self.ending:
             data = self.link.recv(LOOK_PERIOD_S)
-            if not data:
+            t_us = unix_time_us()
+            if data is None:
                 self._recorder.flush()  # tells, where the disk refuses
                 continue
-            t_us = unix_time_us()
             self.peers.add(self.link.peer)
             if self.link.is_datagram:
-                self.link.release_peer()  # whoever else sends here is recorded too
+                self.link.release_peer()  # whoever else sends here is recorded too, an empty datagram or not
             for frame in self._reader.read(data):
                 self._recorder.write(t_us, frame.raw, self.number)
                 self.kinds[frame.message_id] += 1

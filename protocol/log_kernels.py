@@ -14,34 +14,26 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.compiled import compiled, inlined
-
-Bytes = npt.NDArray[np.uint8]
-Table = npt.NDArray[np.int32]
-State = npt.NDArray[np.int64]
-
-FRAME = np.dtype(
-    [
-        ("stamp_us", "<i8"),
-        ("offset", "<i8"),
-        ("message_id", "<u4"),
-        ("length", "<u2"),
-        ("system", "u1"),
-        ("component", "u1"),
-        ("sequence", "u1"),
-        ("version", "u1"),
-        ("signed", "u1"),
-        ("flags", "u1"),
-        ("known", "u1"),
-        ("stamp_ok", "u1"),
-    ]
+from protocol.log_candidates import best_of_overlapping, may_begin, unknown_fits
+from protocol.log_frames import (
+    KNOWN,
+    LEARNED,
+    LEARNED_SHIFT,
+    OWN,
+    SIZE_SHIFT,
+    Bytes,
+    State,
+    Table,
+    byte,
+    checksum_verdict,
+    crc_of,
+    frame_end,
+    message_of,
+    near,
+    signature_size,
+    stamp_at,
+    table_entry,
 )
-"""One row a frame; `protocol.log_scan` says what each column means."""
-
-IDS = 1 << 24
-# An entry of the table of messages: seed, longest MAVLink 1 payload, whether known; a seed learned, whether learned.
-KNOWN, LEARNED = 1 << 16, 1 << 25
-SIZE_SHIFT, LEARNED_SHIFT = 8, 17
-_OWN = KNOWN | 0xFFFF
 
 (
     POSITION,
@@ -59,177 +51,7 @@ _OWN = KNOWN | 0xFFFF
 ) = range(12)
 STATE_SIZE = 12
 
-_DAY_US = 86_400_000_000
-_SIMULATION_OR_DATE_US = 1 << 52  # the year 2112; simulation times begin at 0
 _AGREEING = 2  # frames beyond the first that must agree on a seed
-_MINUTE_US = 60_000_000
-_LOOK_AHEAD = 8
-_1, _2, _3, _4, _5, _6, _7 = (np.uint64(n) for n in range(1, 8))
-
-
-def _crc_tables() -> Table:
-    """tables[k, x]: the checksum's change by byte x when k bytes follow it (CRC-16/MCRF4XX, reflected 0x8408)."""
-    tables = np.zeros((8, 256), dtype=np.int32)
-    first = np.arange(256, dtype=np.int32)
-    for _ in range(8):
-        first = np.where(first & 1, first >> 1 ^ 0x8408, first >> 1).astype(np.int32)
-    tables[0] = first
-    for k in range(1, 8):
-        tables[k] = tables[k - 1] >> 8 ^ first[tables[k - 1] & 0xFF]
-    return tables
-
-
-_TABLES = _crc_tables()
-_FLAT = _TABLES.reshape(-1)
-_BY_HIGH_BYTE = np.zeros(256, dtype=np.int32)
-_BY_HIGH_BYTE[_TABLES[0] >> 8] = np.arange(256, dtype=np.int32)  # the high bytes are a permutation
-
-
-@compiled
-def byte(data: Bytes, at: int) -> int:
-    """data[at] as a signed number; both casts are for speed and for numba's rules of types.
-
-    An unsigned number and a signed one together would be a float; a signed index is first looked at for its sign.
-    """
-    return int(np.int64(data[np.uint64(at)]))
-
-
-@compiled
-def table_entry(row: int, number: int) -> int:
-    """One value of the checksum's tables."""
-    return int(_FLAT[np.uint64(row << 8 | number)])
-
-
-@inlined
-def crc_of(data: Bytes, start: int, stop: int) -> int:
-    """Checksum of data[start:stop], without a seed; eight bytes at a time."""
-    crc = 0xFFFF
-    i = start
-    while i + 8 <= stop:
-        crc ^= byte(data, i) | byte(data, i + 1) << 8
-        crc = (
-            table_entry(7, crc & 0xFF)
-            ^ table_entry(6, crc >> 8)
-            ^ table_entry(5, byte(data, i + 2))
-            ^ table_entry(4, byte(data, i + 3))
-            ^ table_entry(3, byte(data, i + 4))
-            ^ table_entry(2, byte(data, i + 5))
-            ^ table_entry(1, byte(data, i + 6))
-            ^ table_entry(0, byte(data, i + 7))
-        )
-        i += 8
-    while i < stop:
-        crc = (crc >> 8) ^ table_entry(0, (crc ^ byte(data, i)) & 0xFF)
-        i += 1
-    return crc
-
-
-@compiled
-def frame_end(data: Bytes, at: int) -> int:
-    """Where the checksum of the frame that begins at `at` begins, going by its header; -1 where no frame begins."""
-    if at + 8 > data.shape[0]:
-        return -1
-    if data[at] == 0xFD and at + 12 <= data.shape[0]:
-        return at + 10 + byte(data, at + 1)
-    if data[at] == 0xFE:
-        return at + 6 + byte(data, at + 1)
-    return -1
-
-
-@compiled
-def message_of(data: Bytes, at: int) -> int:
-    """The message id of the frame at `at`."""
-    if data[at] == 0xFE:
-        return byte(data, at + 5)
-    return byte(data, at + 7) | byte(data, at + 8) << 8 | byte(data, at + 9) << 16
-
-
-@compiled
-def signature_size(data: Bytes, at: int) -> int:
-    """Bytes of signature behind the checksum of the frame at `at`, going by its header."""
-    return 13 if data[at] == 0xFD and data[at + 2] & 1 else 0
-
-
-@compiled
-def checksum_verdict(data: Bytes, at: int, table: Table) -> int:
-    """What the checksum says of a frame at `at`.
-
-    1: it is one of a known message; 2: of a message whose seed was learned; 0: no frame begins here, or it is not whole;
-    -1 - seed: only that seed would explain it; -257: nothing explains it.
-    """
-    end = frame_end(data, at)
-    if end < 0 or end + 2 + signature_size(data, at) > data.shape[0]:
-        return 0
-    entry = int(table[message_of(data, at)])
-    if data[at] == 0xFE and entry & KNOWN and byte(data, at + 1) > (entry >> SIZE_SHIFT & 0xFF):
-        return 0
-    crc = crc_of(data, at + 1, end)
-    rest = (byte(data, end) | byte(data, end + 1) << 8) ^ (crc >> 8)
-    seed = int(_BY_HIGH_BYTE[rest >> 8])
-    if table_entry(0, seed) != rest:
-        return -257
-    seed ^= crc & 0xFF
-    if entry & KNOWN and seed == (entry & 0xFF):
-        return 1
-    if entry & LEARNED and seed == (entry >> LEARNED_SHIFT & 0xFF):
-        return 2
-    return -1 - seed
-
-
-@compiled
-def stamp_at(data: Bytes, at: int) -> int:
-    """The stamp at `at`, as a signed integer; -1 where none fits."""
-    if at < 0 or at + 8 > data.shape[0]:
-        return -1
-    stamp = 0
-    for i in range(8):
-        stamp = stamp << 8 | byte(data, at + i)
-    return stamp
-
-
-@compiled
-def near(one: int, other: int) -> bool:
-    """Whether two stamps are of the same day or so; before there is one to compare with, whether it is a date at all."""
-    if one < 0 or one >= _SIMULATION_OR_DATE_US:
-        return False
-    return other < 0 or abs(one - other) < _DAY_US
-
-
-@compiled
-def record_follows(data: Bytes, end: int, stamp: int, stamp_size: int) -> bool:
-    """Whether the bytes at `end` look like the next record of a log that was at time `stamp`, or are the log's end."""
-    count = data.shape[0]
-    if end + stamp_size >= count:
-        return True
-    if data[end + stamp_size] != 0xFD and data[end + stamp_size] != 0xFE:
-        return False
-    return stamp_size == 0 or near(stamp_at(data, end), stamp)
-
-
-@compiled
-def may_begin(data: Bytes, at: int, table: Table, stamp_size: int) -> bool:
-    """Whether a checksum at `at` is worth its time: a frame's first byte, and a message or a stamp that is one."""
-    if (data[at] != 0xFD and data[at] != 0xFE) or at + 12 > data.shape[0]:
-        return bool(data[at] == 0xFE) and at + 8 <= data.shape[0]
-    return bool(table[message_of(data, at)] != 0) or stamp_size == 0 or near(stamp_at(data, at - 8), -1)
-
-
-@compiled
-def unknown_fits(data: Bytes, at: int, table: Table, last: int, stamp_size: int) -> bool:
-    """Whether the framing around a frame that no known seed explains is that of a log, and no known frame is inside."""
-    end = frame_end(data, at) + 2 + signature_size(data, at)
-    if stamp_size:
-        stamp = stamp_at(data, at - 8)
-        if not near(stamp, -1) or not record_follows(data, end, stamp, stamp_size):
-            return False
-        if not near(stamp, last) and end + stamp_size >= data.shape[0]:
-            return False
-    elif not record_follows(data, end, -1, 0):
-        return False
-    for inside in range(at + 1, end):
-        if (data[inside] == 0xFD or data[inside] == 0xFE) and checksum_verdict(data, inside, table) == 1:
-            return False
-    return True
 
 
 @compiled
@@ -239,33 +61,10 @@ def learn(table: Table, votes: Table, message: int, seed: int, state: State) -> 
     if vote >> 8 and (vote & 0xFF) == seed:
         votes[message] = vote + 256
         if vote >> 8 == _AGREEING:
-            table[message] = (table[message] & _OWN) | LEARNED | seed << LEARNED_SHIFT
+            table[message] = (table[message] & OWN) | LEARNED | seed << LEARNED_SHIFT
             state[LEARNT] += 1
     else:
         votes[message] = 256 | seed
-
-
-@compiled
-def standing(data: Bytes, at: int, floor: int, last: int, stamp_size: int) -> int:
-    """How much around a frame with a good checksum speaks for it: its own stamp, and what follows it (0 to 2)."""
-    stamp = stamp_at(data, at - stamp_size)
-    own = stamp_size > 0 and at - stamp_size >= floor and near(stamp, last)
-    after = record_follows(data, frame_end(data, at) + 2 + signature_size(data, at), last, stamp_size)
-    return int(own) + int(after)
-
-
-@compiled
-def best_of_overlapping(data: Bytes, at: int, floor: int, table: Table, last: int, stamp_size: int) -> int:
-    """Of the frames with good checksums that overlap the one at `at`, the one for which most speaks; the first of equals."""
-    best, score = at, standing(data, at, floor, last, stamp_size)
-    if score == 2:
-        return best
-    for other in range(at + 1, frame_end(data, at) + 2):
-        if (data[other] == 0xFD or data[other] == 0xFE) and checksum_verdict(data, other, table) > 0:
-            its = standing(data, other, floor, last, stamp_size)
-            if its > score:
-                best, score = other, its
-    return best
 
 
 @inlined
@@ -431,114 +230,3 @@ def is_cut_short(data: Bytes, floor: int, stamp_size: int) -> bool:
         return False
     end = frame_end(data, at)
     return end < 0 or end + 2 + signature_size(data, at) > count
-
-
-@compiled
-def mend_stamps(frames: npt.NDArray[np.void]) -> int:
-    """Replace stamps that damage has made absurd by the one before (the next, at the start); returns how many.
-
-    A stamp that is a minute or more away from the one before is damaged where one of the next few is not; where they all
-    are, the clock was set or the recording paused, and it stands. One without a date is damaged anyhow.
-    """
-    count = frames.shape[0]
-    mended = 0
-    last = -1
-    for i in range(count):
-        stamp = frames[i]["stamp_us"]
-        good = 0 <= stamp < _SIMULATION_OR_DATE_US
-        if good and (last < 0 or abs(stamp - last) > _MINUTE_US):
-            agree, return_to_last = 0, False
-            seen = 0
-            for j in range(i + 1, min(count, i + 1 + _LOOK_AHEAD)):
-                other = frames[j]["stamp_us"]
-                seen += 1
-                agree += abs(other - stamp) <= _MINUTE_US
-                return_to_last = return_to_last or (last >= 0 and abs(other - last) <= _MINUTE_US)
-            if last < 0:
-                good = agree * 2 >= seen
-            elif return_to_last:
-                good = False
-            elif agree == 0:
-                good = abs(stamp - last) < _DAY_US
-        if good:
-            last = stamp
-        else:
-            mended += 1
-            frames[i]["stamp_ok"] = 0
-            frames[i]["stamp_us"] = last
-    following = -1
-    for k in range(count):
-        i = count - 1 - k
-        if frames[i]["stamp_us"] < 0:
-            frames[i]["stamp_us"] = max(following, 0)
-        else:
-            following = frames[i]["stamp_us"]
-    return mended
-
-
-@compiled
-def count_rows(frames: npt.NDArray[np.void], chosen: npt.NDArray[np.uint8], slots: Table, counts: State) -> None:
-    """Count the frames of each slot (`slots` gives slot + 1 of a message id, or 0) into `counts`.
-
-    Left out are frames not chosen, unknown ones and those with flags of unknown meaning; an empty `chosen` is all.
-    """
-    for i in range(frames.shape[0]):
-        frame = frames[i]
-        if frame["known"] and not frame["flags"] & 0xFE and (chosen.shape[0] == 0 or chosen[i]):
-            slot = slots[frame["message_id"]]
-            if slot:
-                counts[slot - 1] += 1
-
-
-@inlined
-def copy_bytes(source: Bytes, start: int, target: Bytes, place: int, count: int) -> None:
-    """Copy bytes, eight at a time: read all before any is written, so that the compiler makes one move of them."""
-    k = 0
-    while k + 8 <= count:
-        i, j = np.uint64(start + k), np.uint64(place + k)
-        b0, b1, b2, b3 = source[i], source[i + _1], source[i + _2], source[i + _3]
-        b4, b5, b6, b7 = source[i + _4], source[i + _5], source[i + _6], source[i + _7]
-        target[j], target[j + _1], target[j + _2], target[j + _3] = b0, b1, b2, b3
-        target[j + _4], target[j + _5], target[j + _6], target[j + _7] = b4, b5, b6, b7
-        k += 8
-    while k < count:
-        target[np.uint64(place + k)] = source[np.uint64(start + k)]
-        k += 1
-
-
-@compiled
-def fill_rows(
-    data: Bytes,
-    frames: npt.NDArray[np.void],
-    chosen: npt.NDArray[np.uint8],
-    slots: Table,
-    places: State,
-    sizes: State,
-    head: int,
-    rows: Bytes,
-) -> None:
-    """Copy each frame that `count_rows` counts into the row at `places` of its slot, which then moves on.
-
-    A row is a head of `head` bytes (stamp, system, component, sequence) and the payload, `sizes` bytes long; `rows` must
-    be zero at first, since a payload may lack trailing zeros. What a newer definition has more is left out.
-    """
-    for i in range(frames.shape[0]):
-        frame = frames[i]
-        if not frame["known"] or frame["flags"] & 0xFE or (chosen.shape[0] > 0 and not chosen[i]):
-            continue
-        slot = int(slots[np.uint64(frame["message_id"])]) - 1
-        if slot < 0:
-            continue
-        place, size = places[np.uint64(slot)], sizes[np.uint64(slot)]
-        places[np.uint64(slot)] = place + head + size
-        stamp = frame["stamp_us"]
-        for k in range(8):
-            rows[np.uint64(place + k)] = stamp >> (8 * k) & 0xFF
-        rows[np.uint64(place + 8)] = frame["system"]
-        rows[np.uint64(place + 9)] = frame["component"]
-        rows[np.uint64(place + 10)] = frame["sequence"]
-        at = frame["offset"]
-        first = at + (10 if frame["version"] == 2 else 6)
-        place += head
-        for k in range(min(size, byte(data, at + 1))):
-            rows[place + k] = data[first + k]

@@ -5,7 +5,7 @@
     scan.raw(7)                                            # the 8th frame as it was on the wire
     scan.counters["damaged_bytes"]
 
-Columns of `Scan.frames` (dtype `log_kernels.FRAME`):
+Columns of `Scan.frames` (dtype `log_log_frames.FRAME`):
 
     stamp_us    time of the record; that of the record before where it is damaged, 0 in a raw stream
     offset      where the frame begins in the file, behind its stamp
@@ -33,9 +33,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from protocol import log_frames
 from protocol import log_kernels as kernels
 from protocol.errors import LogError
 from protocol.log_dialect import layouts
+from protocol.log_rows import mend_stamps
 
 Progress = Callable[[int, int], None]
 """Is told how much of how much is done."""
@@ -106,7 +108,7 @@ class Scan:
 def _known_messages() -> npt.NDArray[np.int32]:
     """The ids that the dialect has, and the entry of each in the kernel's table: shape (2, messages)."""
     entries = [
-        (number, kernels.KNOWN | message.size << kernels.SIZE_SHIFT | message.crc_seed[0])
+        (number, log_frames.KNOWN | message.size << log_frames.SIZE_SHIFT | message.crc_seed[0])
         for number, message in layouts().items()
     ]
     return np.array(entries, dtype=np.int32).T
@@ -119,7 +121,7 @@ def scan_tlog(source: Path | str | bytes, *, progress: Progress | None = None) -
     """
     path = None if isinstance(source, bytes) else Path(source)
     data = np.frombuffer(source, dtype=np.uint8) if isinstance(source, bytes) else _bytes_of(Path(source))
-    table = np.zeros(kernels.IDS, dtype=np.int32)
+    table = np.zeros(log_frames.IDS, dtype=np.int32)
     numbers, entries = _known_messages()
     table[numbers] = entries
     stamp_size = STAMP_SIZE
@@ -142,10 +144,10 @@ def _bytes_of(path: Path) -> npt.NDArray[np.uint8]:
 
 
 def _scan(
-    data: npt.NDArray[np.uint8], stamp_size: int, table: kernels.Table, progress: Progress | None
-) -> tuple[npt.NDArray[np.void], kernels.State]:
-    frames: npt.NDArray[Any] = np.empty(len(data) // 48 + 1024, dtype=kernels.FRAME)
-    votes = np.zeros(kernels.IDS, dtype=np.int32)
+    data: npt.NDArray[np.uint8], stamp_size: int, table: log_frames.Table, progress: Progress | None
+) -> tuple[npt.NDArray[np.void], log_frames.State]:
+    frames: npt.NDArray[Any] = np.empty(len(data) // 48 + 1024, dtype=log_frames.FRAME)
+    votes = np.zeros(log_frames.IDS, dtype=np.int32)
     state = np.zeros(kernels.STATE_SIZE, dtype=np.int64)
     state[[kernels.SEARCH, kernels.LAST_STAMP, kernels.RAW_STAMP]] = -1
     for start in range(0, len(data), _SLICE):
@@ -167,7 +169,7 @@ def _is_raw(frames: npt.NDArray[np.void]) -> bool:
 
 
 def _count(
-    data: npt.NDArray[np.uint8], frames: npt.NDArray[np.void], stamp_size: int, state: kernels.State
+    data: npt.NDArray[np.uint8], frames: npt.NDArray[np.void], stamp_size: int, state: log_frames.State
 ) -> dict[str, int]:
     counters = dict.fromkeys(COUNTERS, 0)
     counters["damaged_bytes"] = int(state[kernels.DAMAGED])
@@ -179,7 +181,7 @@ def _count(
     counters[tail] += rest
     if stamp_size:
         counters["unstamped_frames"] = int(state[kernels.UNSTAMPED])
-        counters["damaged_stamps"] = int(kernels.mend_stamps(frames)) - counters["unstamped_frames"]
+        counters["damaged_stamps"] = int(mend_stamps(frames)) - counters["unstamped_frames"]
     else:
         frames["stamp_us"] = 0
     counters["unknown_frames"] = int(np.count_nonzero(frames["known"] == 0))

@@ -15,8 +15,9 @@ from collections.abc import Collection
 import numpy as np
 import numpy.typing as npt
 
-from protocol import log_kernels as kernels
 from protocol.log_dialect import layouts, layouts_by_name
+from protocol.log_frames import IDS
+from protocol.log_rows import count_rows, fill_rows
 from protocol.log_scan import Scan
 
 HEAD = (("t_us", "<i8"), ("system", "u1"), ("component", "u1"), ("frame_sequence", "u1"))
@@ -39,17 +40,17 @@ def tables(scan: Scan, names: Collection[str] | None = None, chosen: npt.NDArray
     """
     wanted = {number: message for number, message in layouts().items() if names is None or message.name in names}
     numbers = sorted(wanted)
-    slots = np.zeros(kernels.IDS, dtype=np.int32)
+    slots = np.zeros(IDS, dtype=np.int32)
     slots[numbers] = np.arange(1, len(numbers) + 1)
     sizes = np.array([wanted[number].size for number in numbers], dtype=np.int64)
     counts = np.zeros(len(numbers), dtype=np.int64)
     mask = np.zeros(0, dtype=np.uint8) if chosen is None else chosen.view(np.uint8)
-    kernels.count_rows(scan.frames, mask, slots, counts)
+    count_rows(scan.frames, mask, slots, counts)
     head = np.dtype(list(HEAD)).itemsize
     ends = np.cumsum(counts * (sizes + head))
     starts = ends - counts * (sizes + head)
     rows = np.zeros(int(ends[-1]) if len(ends) else 0, dtype=np.uint8)
-    kernels.fill_rows(scan.data, scan.frames, mask, slots, starts.copy(), sizes, head, rows)
+    fill_rows(scan.data, scan.frames, mask, slots, starts.copy(), sizes, head, rows)
     return {
         wanted[number].name: rows[start:end].view(table_dtype(wanted[number].name))
         for number, start, end in zip(numbers, starts, ends, strict=True)

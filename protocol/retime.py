@@ -19,7 +19,7 @@ from protocol.errors import UsageError
 from protocol.log_dialect import layouts
 from protocol.log_scan import Scan
 from protocol.log_tables import tables
-from protocol.mavlink_codec import CRC_SIZE, HEADER_V1, HEADER_V2, MAGIC_V1, SIGNATURE_SIZE, SIGNED, Layout
+from protocol.mavlink_codec import CRC_SIZE, HEADER_V1, HEADER_V2, MAGIC_V1, SIGNED, Layout
 
 TIME_FIELDS = MappingProxyType({"time_usec": 1, "time_boot_us": 1, "time_unix_usec": 1, "time_boot_ms": 1000})
 """Names of the fields that are moved, and their unit in us."""
@@ -149,8 +149,3 @@ class Signer:
         packet.sign_packet(self._mavlink)
         self.signed += 1
         return bytes(packet._msgbuf)
-
-
-def unsigned(frame: bytes) -> bool:
-    """Whether a frame carries no signature."""
-    return frame[0] == MAGIC_V1 or not frame[2] & SIGNED or len(frame) < HEADER_V2 + CRC_SIZE + SIGNATURE_SIZE

@@ -1,23 +1,28 @@
-"""What of a log a command is to show: messages, systems, a stretch of time."""
+"""What of a log a command is to show, export, replay or compare: messages, systems, a stretch of time."""
 
 from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import click
+import numpy as np
+import numpy.typing as npt
 
 from fwav_hil.logs.working import Working
-from protocol.errors import UsageError
+from protocol.errors import LogError, UsageError
 from protocol.kernel_cache import cache_folder
-from protocol.log_files import Log, Sender, open_log
+from protocol.log_dialect import layouts_by_name
+from protocol.log_files import Log, Sender, chosen_rows, open_log
+from protocol.log_scan import Scan
 
 _DAY_US = 86_400_000_000
 _TIME_OF_DAY = re.compile(r"(\d{1,2}):([0-5]\d):([0-5]\d(?:\.\d+)?)")
 _SENDER = re.compile(r"(\d{1,3})(?:/(\d{1,3}))?")
+_UNKNOWN = "UNKNOWN_"
 
 
 @dataclass(frozen=True)
@@ -29,26 +34,35 @@ class Choice:
     between_us: tuple[int, int] | None = None
 
 
+def log_file(path: Path) -> Path:
+    """The log that a user means: the file itself, or that of a run folder."""
+    return path / "run.tlog" if path.is_dir() else path
+
+
 def open_with_progress(path: Path) -> Log:
     """`open_log` of a log or of a run folder's, telling how far it is. Raises LogError."""
     warm = cache_folder() / "warm-logs"
     if not warm.exists():
         click.echo("compiling the log reader (once after each installation, some ten seconds) ...", err=True)
-    log_path = path / "run.tlog" if path.is_dir() else path
-    with Working(f"reading {log_path.name}") as working:
-        log = open_log(log_path, progress=working)
+    with Working(f"reading {log_file(path).name}") as working:
+        log = open_log(log_file(path), progress=working)
     warm.touch()
     return log
 
 
+def open_telemetry(path: Path) -> tuple[Log, Scan]:
+    """A MAVLink log (or a run folder's) and its frames. Raises LogError, also for what an autopilot wrote of itself."""
+    log = open_with_progress(path)
+    if log.scan is None:
+        raise LogError(
+            f"{log.path} holds no MAVLink frames, it is of the kind {log.kind}: `fwav-hil log` shows its tables"
+        )
+    return log, log.scan
+
+
 def choose(log: Log, types: Sequence[str], systems: Sequence[str], start: str | None, end: str | None) -> Choice:
     """What the options of a command say. Raises UsageError for what the log does not hold."""
-    held = {name.upper(): name for name in log.names()}
-    names = []
-    for name in (name.strip() for item in types for name in item.split(",") if name.strip()):
-        if name.upper() not in held and not name.startswith("UNKNOWN_"):
-            raise UsageError(f"--types {name}: {log.path} holds no such message{near_matches(name, held.values())}")
-        names.append(held.get(name.upper(), name))
+    names = held_names(types, names_in(log), log.path)
     if systems and log.scan is None:
         raise UsageError(f"--system: {log.path} is a log that an autopilot wrote of itself, it names no systems")
     first, last = log.span_us()
@@ -63,6 +77,44 @@ def choose(log: Log, types: Sequence[str], systems: Sequence[str], start: str | 
                 f"no time of {log.path} is left between --from and --to: it is {(last - first) * 1e-6:g} s long"
             )
     return Choice(names or None, [_sender(text) for text in systems] or None, between)
+
+
+def choose_frames(log: Log, scan: Scan, choice: Choice) -> npt.NDArray[np.bool_]:
+    """A truth value for each frame of the log's scan. Raises UsageError where nothing is left."""
+    rows = chosen_rows(scan, choice.between_us, choice.senders)
+    chosen = np.ones(len(scan), dtype=np.bool_) if rows is None else rows
+    if choice.names is not None:
+        unknown = [int(name.removeprefix(_UNKNOWN)) for name in choice.names if name.startswith(_UNKNOWN)]
+        known = [layouts_by_name()[name].message_id for name in choice.names if not name.startswith(_UNKNOWN)]
+        numbers, is_known = scan.frames["message_id"], scan.frames["known"] == 1
+        chosen &= (is_known & np.isin(numbers, known)) | (~is_known & np.isin(numbers, unknown))
+    if not chosen.any():
+        first, last = log.span_us()
+        senders = sorted(set(zip(scan.frames["system"].tolist(), scan.frames["component"].tolist(), strict=True)))
+        raise UsageError(
+            f"no frame of {log.path} is left: it is {(last - first) * 1e-6:.1f} s long, begins at {time_of_day(first)}, "
+            f"holds {', '.join(names_in(log))}, from {', '.join(f'{s}/{c}' for s, c in senders)}: choose among these"
+        )
+    return chosen
+
+
+def names_in(log: Log) -> list[str]:
+    """The messages of a log by name, those the dialect lacks as UNKNOWN_ and their number."""
+    if log.scan is None:
+        return log.names()
+    frames = log.scan.frames
+    return log.names() + [f"{_UNKNOWN}{number}" for number in np.unique(frames["message_id"][frames["known"] == 0])]
+
+
+def held_names(types: Sequence[str], held: Collection[str], where: object) -> list[str]:
+    """The names of an option that may be repeated and may hold several, in any case. Raises UsageError for one not held."""
+    by_upper = {name.upper(): name for name in held}
+    names = []
+    for name in (name.strip() for item in types for name in item.split(",") if name.strip()):
+        if name.upper() not in by_upper:
+            raise UsageError(f"--types {name}: {where} holds no such message{near_matches(name, held)}")
+        names.append(by_upper[name.upper()])
+    return names
 
 
 def moment_us(text: str, first_us: int, option: str) -> int:
@@ -81,6 +133,12 @@ def moment_us(text: str, first_us: int, option: str) -> int:
         raise UsageError(
             f"{option} {text} is no time: write seconds since the log began, such as 12.5, or a time of day HH:MM:SS"
         ) from None
+
+
+def time_of_day(stamp_us: int) -> str:
+    """The time of day (UTC) of a stamp, HH:MM:SS.t; of simulation time, the time since its beginning."""
+    tenths = stamp_us % _DAY_US // 100_000
+    return f"{tenths // 36_000:02d}:{tenths // 600 % 60:02d}:{tenths // 10 % 60:02d}.{tenths % 10}"
 
 
 def _sender(text: str) -> Sender:

@@ -9,16 +9,19 @@ import click
 
 from bridge.command_line import json_option, options
 from bridge.summary import is_stdout, show_json
+from protocol.errors import UsageError
 
 log_argument = click.argument("log", type=click.Path(path_type=Path))
-when_options = options(
-    click.option(
-        "--system", "systems", multiple=True, metavar="N[/C]",
-        help="Messages of this system, or of one component of it, only; may be repeated.",
-    ),
-    click.option("--from", "start", metavar="TIME", help="From here on: seconds since the log began, or HH:MM:SS (UTC)."),
-    click.option("--to", "end", metavar="TIME", help="Up to here, as in --from."),
+system_option = click.option(
+    "--system", "systems", multiple=True, metavar="N[/C]",
+    help="Messages of this system, or of one component of it, only; may be repeated.",
 )  # fmt: skip
+from_option = click.option(
+    "--from", "start", metavar="TIME", help="From here on: seconds since the log began, or HH:MM:SS (UTC)."
+)
+when_options = options(
+    system_option, from_option, click.option("--to", "end", metavar="TIME", help="Up to here, as in --from.")
+)
 types_option = click.option(
     "--types", multiple=True, metavar="MSG,...", help="Messages of these names only; may be repeated."
 )
@@ -94,23 +97,47 @@ def plot_command(
     click.echo(f"plot: {path}")
 
 
-@log_group.command("export", epilog="\b\nExample:\n  fwav-hil log export flight.tlog --to mcap --out flight.mcap")
+@log_group.command(
+    "export", epilog="\b\nExample:\n  fwav-hil log export flight.tlog --to mcap --types ATTITUDE --from 10 --to 60"
+)
 @options(
     log_argument,
     click.option(
-        "--to", "kind", type=click.Choice(["parquet", "csv", "mcap"]), required=True,
-        help="mcap: one file for Foxglove and PlotJuggler. parquet, csv: a folder with one file for each message.",
+        "--to", "targets", multiple=True, required=True, metavar="FORMAT|TIME",
+        help="mcap: one file for Foxglove and PlotJuggler. parquet, csv: a folder with one file for each message. "
+        "A time: where to end, as --from.",
     ),
+    types_option,
+    system_option,
+    from_option,
     click.option("--out", type=click.Path(path_type=Path), metavar="PATH",
                  help="File (mcap) or folder; by default named after the log, in this folder."),
     json_option,
 )  # fmt: skip
-def export_command(log: Path, kind: str, out: Path | None, json_path: Path | None) -> None:
+def export_command(
+    log: Path,
+    targets: tuple[str, ...],
+    types: tuple[str, ...],
+    systems: tuple[str, ...],
+    start: str | None,
+    out: Path | None,
+    json_path: Path | None,
+) -> None:
     """Write LOG in a format of other programs. What is there already is never overwritten."""
-    from fwav_hil.logs.choice import Choice, open_with_progress
-    from fwav_hil.logs.export import default_output, export_log
+    from fwav_hil.logs.choice import choose, choose_frames, open_with_progress
+    from fwav_hil.logs.export import SUFFIXES, default_output, export_log
 
-    result = export_log(open_with_progress(log), kind, out or default_output(log, kind), Choice())
+    kinds = [target for target in targets if target in SUFFIXES]
+    ends = [target for target in targets if target not in SUFFIXES]
+    if len(kinds) != 1 or len(ends) > 1:
+        raise UsageError(f"say what to write once: --to {', '.join(SUFFIXES)} (and --to TIME for the end)")
+    opened = open_with_progress(log)
+    choice = choose(opened, types, systems, start, ends[0] if ends else None)
+    if choice.names and all(name.startswith("UNKNOWN_") for name in choice.names):
+        raise UsageError(f"nothing says what is in {', '.join(choice.names)}: `fwav-hil log dump` shows the bytes")
+    if opened.scan is not None:
+        choose_frames(opened, opened.scan, choice)  # says so where nothing is left
+    result = export_log(opened, kinds[0], out or default_output(log, kinds[0]), choice)
     messages = sum(result["messages"].values())
     click.echo(f"{result['out']}: {messages} messages of {len(result['messages'])} kinds", err=is_stdout(json_path))
     show_json(json_path, result)

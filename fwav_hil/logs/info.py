@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,8 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
+from bridge.sidecar import link_numbers, read_sidecar
+from protocol.errors import RunFolderError
 from protocol.log_dialect import layouts
 from protocol.log_files import Log
 from protocol.log_scan import Scan
@@ -18,6 +21,8 @@ GAP = 3.0
 """An interval longer than this many times the usual (median) one is a gap."""
 
 PLACES_SHOWN = 20
+_WIDTH_ELSEWHERE = 120
+"""Columns where there is no terminal: no name is cut off."""
 _YEAR_2000_S = 946_684_800.0
 
 
@@ -26,7 +31,8 @@ def log_info(log: Log) -> dict[str, Any]:
 
     kind, bytes, start_s (of the first record), duration_s, messages, rate_hz; systems (MAVLink logs: system, component,
     messages, lost, out_of_order, versions, signed); types (name, system, component, count, rate_hz, interval_s: the median,
-    gaps, longest_gap_s); damage (counters, and places: offset and bytes of the first stretches of damage).
+    gaps, longest_gap_s); recording (of a log of this project, by its sidecar: complete, lost, error, stamps, links: uri, peer,
+    sent and received frames); damage (counters, and places: offset and bytes of the first stretches of damage).
     """
     first, last = log.span_us()
     count = len(log.scan) if log.scan is not None else sum(len(table) for table in log.tables().values())
@@ -41,8 +47,33 @@ def log_info(log: Log) -> dict[str, Any]:
         "rate_hz": (count - 1) / duration_s if duration_s > 0 else None,
         "systems": _systems(log.scan) if log.scan is not None else [],
         "types": _types_of_scan(log.scan) if log.scan is not None else _types_of_tables(log),
+        "recording": _recording(log),
         "damage": dict(log.counters) | ({"places": _places(log.scan)} if log.scan is not None else {}),
     }
+
+
+def _recording(log: Log) -> dict[str, Any] | None:
+    """What the sidecar beside a log says of it; None where there is none, or it cannot be read."""
+    try:
+        sidecar = read_sidecar(log.path)
+        if not sidecar or log.scan is None:
+            return None
+        frames = log.scan.frames
+        numbers = link_numbers(log.path, frames["offset"] - log.scan.stamp_size)
+    except RunFolderError:
+        return None
+    links = []
+    for number, link in enumerate(sidecar["links"]):
+        here = frames[numbers == number]
+        sent = sum(
+            int(np.count_nonzero((here["system"] == system) & (here["component"] == component)))
+            for system, component in link["sent_by"]
+        )
+        links.append({"uri": link["uri"], "peer": link["peer"], "sent": sent, "received": len(here) - sent})
+    said = {
+        key: sidecar.get(key) for key in ("version", "scenario", "seed", "clock", "stamps", "complete", "lost", "error")
+    }
+    return said | {"links": links}
 
 
 def _systems(scan: Scan) -> list[dict[str, Any]]:
@@ -110,12 +141,17 @@ def _places(scan: Scan) -> list[dict[str, int]]:
 
 def print_info(info: dict[str, Any], *, to_stderr: bool = False) -> None:
     """Print what `log_info` gives."""
-    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr)
+    stream = sys.stderr if to_stderr else sys.stdout
+    console = Console(
+        highlight=False, soft_wrap=True, stderr=to_stderr, width=None if stream.isatty() else _WIDTH_ELSEWHERE
+    )
     rate = f", {info['rate_hz']:.0f} a second" if info["rate_hz"] else ""
     console.print(f"{info['log']}: {info['kind']}, {info['bytes']} bytes")
     console.print(
         f"{info['messages']} messages in {info['duration_s']:.3f} s{rate}, from {_moment(info['start_s'])} on"
     )
+    if info["recording"]:
+        _print_recording(console, info["recording"])
     if info["systems"]:
         console.print(_systems_table(info["systems"]))
     console.print(_types_table(info["types"]))
@@ -125,6 +161,18 @@ def print_info(info: dict[str, Any], *, to_stderr: bool = False) -> None:
     if places:
         shown = ", ".join(f"{place['offset']} ({place['bytes']})" for place in places)
         console.print(f"at byte (bytes): {shown}" + (" ..." if len(places) == PLACES_SHOWN else ""))
+
+
+def _print_recording(console: Console, recording: dict[str, Any]) -> None:
+    """What the sidecar adds to a log: whether it is whole, and the links."""
+    whole = "complete" if recording["complete"] else "not complete: it was cut short, or is still being written"
+    if recording["lost"]:
+        whole = f"not complete: {recording['lost']} frames are missing ({recording['error']})"
+    scenario = f" of {recording['scenario']}" if recording["scenario"] else ""
+    console.print(f"recorded by fwav-hil {recording['version']}{scenario}, {whole}; stamps are {recording['stamps']}")
+    for link in recording["links"]:
+        peer = f" ({link['peer']})" if link["peer"] else ""
+        console.print(f"link {link['uri']}{peer}: {link['sent']} frames sent, {link['received']} received")
 
 
 def _moment(t_s: float) -> str:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from bridge.command_line import json_option, law_option, options, wait_option
+from bridge.command_line import begin_process, json_option, law_option, options, realtime_option, wait_option
 from bridge.summary import is_stdout, show_json, write_json
-from protocol.errors import RunFolderError, UsageError
+from protocol.errors import Interrupted, RunFolderError, UsageError
 
 EXAMPLE = """
 \b
@@ -67,6 +67,7 @@ def _speed(_context: click.Context, _option: click.Parameter, text: str) -> floa
         "--signing-key", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
         help="Sign every frame with this key: 64 hexadecimal digits, or 32 bytes.",
     ),
+    realtime_option,
     law_option,
     click.option(
         "--scenario", metavar="SCENARIO", help="Scenario of the log, instead of the one in the log's folder (--into).",
@@ -92,6 +93,7 @@ def replay_command(
     max_gap_s: float | None,
     rewrite_time: bool,
     signing_key: Path | None,
+    realtime: bool,
     law: str | None,
     scenario: str | None,
     fast: bool,
@@ -113,30 +115,44 @@ def replay_command(
         raise UsageError(
             "say where to replay once: --to URI (and --to TIME for the end), or --into controller|emulator"
         )
+    of_links = {
+        "--from": begin, "--to TIME": ends, "--speed": speed != 1.0, "--types": types, "--system": systems, "--loop": loop,
+        "--max-gap": max_gap_s is not None, "--rewrite-time": rewrite_time, "--signing-key": signing_key,
+    }  # fmt: skip
+    of_ends = {"--law": law, "--scenario": scenario, "--fast": fast, "--out": out, "--no-plots": not plots}
+    if misplaced := [name for name, given in (of_links if into else of_ends).items() if given]:
+        right, wrong = ("to a link (--to URI)", "--into") if into else ("--into controller|emulator", "to a link")
+        raise UsageError(f"{', '.join(misplaced)}: for replays {right}, of no effect {wrong}: leave it out")
+    if realtime and (into or speed is None):
+        raise UsageError(
+            "--realtime is about keeping the time of a log on its way to a link: leave out --into, --speed max"
+        )
     if into:
         return _replay_into(
             log, into, law=law, scenario=scenario, fast=fast, out=out, plots=plots, wait_s=wait_s, json_path=json_path
         )
-    from bridge.process import StopFlag
-    from fwav_hil.replay.selection import Choice, choose, open_log, split_names
+    from fwav_hil.logs.choice import choose, choose_frames, open_telemetry
     from fwav_hil.replay.to_link import ReplayOptions, replay_to
 
-    stop = StopFlag()
-    stop.install()
-    scan = open_log(log)
-    choice = Choice(begin=begin, end=ends[0] if ends else None, types=split_names(types), systems=split_names(systems))
+    report, stop = begin_process("text", None, with_parent=False)
+    opened, scan = open_telemetry(log)
+    chosen = choose_frames(opened, scan, choose(opened, types, systems, begin, ends[0] if ends else None))
     how = ReplayOptions(
         speed=speed, loop=loop, max_gap_s=max_gap_s, rewrite_time=rewrite_time, signing_key=signing_key,
-        wait_s=wait_s,
+        realtime=realtime, wait_s=wait_s,
     )  # fmt: skip
-    result = replay_to(scan, choose(scan, choice), uris[0], how, stop)
+    result = replay_to(scan, chosen, uris[0], how, report, stop)
     late = result["lateness_us"]
-    shown = f", late by p50 {late['p50']:.0f} us, p99 {late['p99']:.0f} us" if late["p50"] is not None else ""
+    shown = ", ".join(f"{name} {late[name]:.0f} us" for name in ("p50", "p99", "max") if late[name] is not None)
     click.echo(
-        f"{result['frames']} frames, {result['log_s']:.1f} s of log in {result['wall_s']:.1f} s{shown}",
+        f"{result['frames']} frames, {result['log_s']:.1f} s of log in {result['wall_s']:.1f} s"
+        + (f" ({result['speed_measured']:.4g} x)" if result["speed_measured"] else "")
+        + (f", late by {shown}" if shown else ""),
         err=is_stdout(json_path),
     )
     show_json(json_path, result)
+    if result["interrupted"]:
+        raise Interrupted(f"interrupted after {result['frames']} frames")
     return 0
 
 

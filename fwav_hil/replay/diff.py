@@ -128,7 +128,45 @@ def compare_logs(
         if len(here):
             times_us = _times_us(one)[here]
             fields += _compare_fields(message, sender, one[here], two[there], times_us, tolerances)
+    _compare_unknown(first, second, types, fields, only)
     return LogDifference(fields, *only)
+
+
+def _compare_unknown(
+    first: Scan,
+    second: Scan,
+    types: Sequence[str] | None,
+    fields: list[FieldDifference],
+    only: tuple[dict[str, int], dict[str, int]],
+) -> None:
+    """Frames of messages that the dialect lacks: paired by their order, their payloads either the same or not."""
+    groups = [_unknown_by_sender(scan) for scan in (first, second)]
+    for message, sender in sorted(groups[0].keys() | groups[1].keys()):
+        if types and message not in types:
+            continue
+        one, two = (group.get((message, sender), []) for group in groups)
+        for rows, others, missing in ((one, two, only[0]), (two, one, only[1])):
+            if len(rows) > len(others):
+                missing[f"{message} {sender}"] = len(rows) - len(others)
+        pairs = list(zip(one, two, strict=False))
+        if pairs:
+            apart = [row for row, (a, b) in enumerate(pairs) if first.payload(a) != second.payload(b)]
+            first_s = float(first.frames["stamp_us"][pairs[apart[0]][0]]) * 1e-6 if apart else None
+            largest = float("inf") if apart else 0.0
+            fields.append(
+                FieldDifference(
+                    message, sender, "payload", 0.0, len(pairs), len(apart), len(apart), largest, largest, first_s
+                )
+            )
+
+
+def _unknown_by_sender(scan: Scan) -> dict[tuple[str, str], list[int]]:
+    rows: dict[tuple[str, str], list[int]] = {}
+    for row in np.flatnonzero(scan.frames["known"] == 0).tolist():
+        frame = scan.frames[row]
+        key = f"UNKNOWN_{frame['message_id']}", f"{frame['system']}/{frame['component']}"
+        rows.setdefault(key, []).append(row)
+    return rows
 
 
 def _by_sender(by_message: Mapping[str, Table]) -> dict[tuple[str, str], Table]:
@@ -212,6 +250,10 @@ def _apart(one: npt.NDArray[Any], two: npt.NDArray[Any]) -> npt.NDArray[np.float
         same = (a == b) | (np.isnan(a) & np.isnan(b))
         apart = np.where(same, 0.0, np.where(np.isnan(apart), np.inf, apart))
     else:
-        apart = np.where(one >= two, one - two, two - one).astype(float)  # unsigned numbers do not go below zero
+        # As 64 bits without a sign the greater less the smaller is right for every kind of whole number.
+        a, b = (
+            column.astype(np.int64 if column.dtype.kind == "i" else np.uint64).view(np.uint64) for column in (one, two)
+        )
+        apart = np.where(one >= two, a - b, b - a).astype(float)
     largest: npt.NDArray[np.float64] = apart.reshape(len(apart), -1).max(axis=1)
     return largest

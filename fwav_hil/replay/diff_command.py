@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,19 +42,18 @@ def diff_command(
     \b
     Exit codes: 0 the same within the tolerances, 1 different; others as ever.
     """
+    from fwav_hil.logs.choice import held_names, names_in, open_telemetry
     from fwav_hil.replay.command import DIFFERENT
     from fwav_hil.replay.diff import compare_logs, parse_tolerances
-    from fwav_hil.replay.selection import Choice, choose, open_log, split_names
 
     allowed = parse_tolerances(tolerances)
-    names = tuple(name.upper() for name in split_names(types))
-    scans = open_log(first), open_log(second)
-    if names:
-        for scan in scans:
-            choose(scan, Choice(types=names))  # says so where a log has none of them
-    difference = compare_logs(*scans, allowed, names or None)
+    (one, first_scan), (two, second_scan) = open_telemetry(first), open_telemetry(second)
+    names = held_names(
+        types, {**dict.fromkeys(names_in(one)), **dict.fromkeys(names_in(two))}, f"{one.path} or {two.path}"
+    )
+    difference = compare_logs(first_scan, second_scan, allowed, names or None)
     _print(difference, to_stderr=is_stdout(json_path))
-    show_json(json_path, {"first": str(scans[0].path), "second": str(scans[1].path), **difference.as_dict()})
+    show_json(json_path, {"first": str(one.path), "second": str(two.path), **difference.as_dict()})
     return 0 if difference.is_same else DIFFERENT
 
 
@@ -62,7 +62,9 @@ def _print(difference: LogDifference, *, to_stderr: bool) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr)
+    stream = sys.stderr if to_stderr else sys.stdout
+    width = None if stream.isatty() else 120  # no name is cut off in a file
+    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr, width=width)
     beyond = sorted((f for f in difference.fields if f.beyond), key=lambda f: (f.first_s or 0.0, f.message, f.field))
     if beyond:
         table = Table("field", "sender")
@@ -83,4 +85,6 @@ def _print(difference: LogDifference, *, to_stderr: bool) -> None:
         words = "identical" if not changed else f"the same within the tolerances ({changed} fields differ by less)"
         console.print(f"{words}: {len(difference.fields)} fields, {pairs} values compared")
     else:
-        console.print(f"different: {len(beyond)} of {len(difference.fields)} fields")
+        alone = sum(difference.only_first.values()) + sum(difference.only_second.values())
+        partnerless = f", {alone} rows without a partner" if alone else ""
+        console.print(f"different: {len(beyond)} of {len(difference.fields)} fields{partnerless}")

@@ -130,7 +130,7 @@ def compare_motion(run: Recorded, sent: Mapping[int, bytes]) -> Difference:
         return sample.q if sample else np.full(6, np.nan)
 
     def pose_in(datagram: bytes) -> bytes:
-        return next(f.payload for f in reader.read(datagram) if f.message_id == mavlink_map.POSE.message_id)
+        return next((f.payload for f in reader.read(datagram) if f.message_id == mavlink_map.POSE.message_id), b"")
 
     def equal(tick: Tick) -> bool:
         return tick.datagram == sent[tick.t_ns]

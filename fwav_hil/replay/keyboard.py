@@ -55,11 +55,12 @@ class Keyboard:
         self._rest = b""
         at = 0
         while at < len(data):
-            size = 3 if data[at] == 0x1B else 1
+            size = 3 if data[at] == 0x1B and data[at + 1 : at + 2] in (b"", b"[", b"O") else 1
             key = data[at : at + size]
             if len(key) < size:
                 self._rest = key  # the rest of an arrow key is still to come
                 return
+            key = key.replace(b"\x1bO", b"\x1b[")  # as terminals in application mode send them
             if key in KEYS:
                 KEYS[key](player)
             at += size

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from bridge.endpoint import VEHICLE
 from bridge.sidecar import read_sidecar
 from bridge.summary import read_json
-from fwav_hil.replay.selection import log_file, open_log
+from fwav_hil.logs.choice import open_telemetry
 from protocol import mavlink_map
 from protocol.errors import LogError, UsageError
 from protocol.log_scan import Scan
@@ -46,8 +46,8 @@ def recorded_run(log: Path, scenario_name: str | None, law: str | None) -> Recor
 
     Raises LogError, ScenarioError, and UsageError where there is no scenario.
     """
-    path = log_file(log)
-    scan = open_log(path)
+    opened, scan = open_telemetry(log)
+    path = opened.path
     scenario = _scenario_of(path, scenario_name)
     clock = read_sidecar(path).get("clock") or read_json(path.parent / "emulator.json").get("clock") or "lockstep"
     ticks = _ticks(scan, (VEHICLE[0], scenario.wire.emulator_component))

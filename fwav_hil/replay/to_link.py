@@ -15,39 +15,49 @@ from rich.progress import Progress as Bar
 
 from bridge.clock import Clock, PunctualClock, unix_time_us
 from bridge.link import NOBODY, Link
-from bridge.process import StopFlag, open_patiently
+from bridge.process import Report, StopFlag, open_patiently
+from bridge.realtime import Settings, maybe_real_time, own_core, report_settings
 from bridge.replay import Player, log_times_ns
 from bridge.summary import percentiles_us
+from fwav_hil.logs.choice import time_of_day
 from fwav_hil.progress import StatusLine
 from fwav_hil.replay.keyboard import HELP, Keyboard
-from fwav_hil.replay.selection import time_of_day
-from protocol.errors import Interrupted, PeerMissingError
+from protocol.errors import PeerMissingError, UsageError
 from protocol.log_scan import Scan
 from protocol.retime import Signer, TimeMover, read_key
 
 _DRAIN_LIMIT = 100
+_DRAW_PERIOD_NS = 200_000_000
+_DRAW_ROOM_NS = 3_000_000
+"""Drawing the bar takes a millisecond or two: it waits for a moment when nothing is due, at most five periods."""
 
 
 class ReplayOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How a log is replayed. speed: of log time; None is as fast as it goes."""
+    """How a log is replayed. speed: of log time; None is as fast as it goes. realtime: with what `real_time` asks for."""
 
     speed: float | None = 1.0
     loop: bool = False
     max_gap_s: float | None = None
     rewrite_time: bool = False
     signing_key: Path | None = None
+    realtime: bool = False
     wait_s: float = 30.0
 
 
 def replay_to(
-    scan: Scan, chosen: npt.NDArray[np.bool_], uri: str, options: ReplayOptions, stop: StopFlag
+    scan: Scan, chosen: npt.NDArray[np.bool_], uri: str, options: ReplayOptions, report: Report, stop: StopFlag
 ) -> dict[str, Any]:
-    """Replay the chosen frames; returns what was sent, and how punctually. Raises LinkError, PeerError, Interrupted."""
+    """Replay the chosen frames; returns what was sent, and how punctually. Raises LinkError, PeerError and UsageError,
+    and Interrupted where the user stopped it before it began.
+    """
     key = read_key(options.signing_key) if options.signing_key else None
     with open_patiently(uri, options.wait_s, stop) as link:
-        clock = PunctualClock()
+        clock = PunctualClock(sleeps_half=options.realtime)
         _await_peer(link, options.wait_s, clock, stop)
-        return Replay(scan, chosen, link, options, clock, stop, key).run()
+        replay = Replay(scan, chosen, link, options, clock, stop, key)
+        with maybe_real_time(own_core(0), wanted=options.realtime) as settings:
+            report_settings(report, settings)
+            return replay.run(settings)
 
 
 def _await_peer(link: Link, wait_s: float, clock: Clock, stop: StopFlag) -> None:
@@ -80,7 +90,9 @@ class Replay:
         key: bytes | None = None,
     ) -> None:
         self._scan = scan
-        self._data = scan.data.tobytes()
+        self._data = scan.data.data
+        # Of what the dialect does not know, or knows as another message, nothing may be changed.
+        self._known: list[bool] = ((scan.frames["known"] == 1) & (scan.frames["flags"] & 0xFE == 0))[chosen].tolist()
         self._begins: list[int] = scan.frames["offset"][chosen].tolist()
         self._ends: list[int] = scan.ends()[chosen].tolist()
         self._stamps_us = scan.frames["stamp_us"][chosen]
@@ -90,16 +102,22 @@ class Replay:
         self._stop = stop
         self._mover = TimeMover(scan, chosen, unix_time_us()) if options.rewrite_time else None
         self._signer = Signer(key) if key else None
+        self._not_signed = 0
+        self._told_of_refusal = False
         self._were_signed = int(np.count_nonzero(scan.frames["signed"][chosen]))
         times_ns = log_times_ns(self._stamps_us, options.max_gap_s)
+        if options.loop and options.speed and not times_ns[-1]:
+            raise UsageError("--loop: all frames chosen are of one moment, which has no length: choose more of the log")
         self._pass_us = int(times_ns[-1]) // 1000 + 1
         self.player = Player(times_ns, self._prepare, link.send, clock, speed=options.speed, look=self._attend)
         self._keyboard = Keyboard()
-        self._display = _Display(len(self._begins))
+        self._display = _Display(len(self._begins), clock)
 
-    def run(self) -> dict[str, Any]:
-        """Play it. Raises Interrupted where the user stopped it, PeerMissingError where nobody took anything."""
-        begun_ns = self._clock.now_ns()
+    def run(self, settings: Settings = ()) -> dict[str, Any]:
+        """Play it; the result says whether the user stopped it. Raises PeerMissingError where nobody took anything.
+
+        settings: what came of asking for real time, for the result.
+        """
         with self._keyboard, self._display:
             if self._keyboard.active:
                 self._display.say(HELP)
@@ -108,24 +126,30 @@ class Replay:
                     f"{self._were_signed} frames carry the signatures of their day, which a receiver that checks them "
                     "refuses: sign anew with --signing-key FILE"
                 )
+            begun_ns = self._clock.now_ns()
             self.player.play(loop=self._options.loop)
+            wall_ns = self._clock.now_ns() - begun_ns
             self._attend(self.player)
-        result = self._result(self._clock.now_ns() - begun_ns)
-        if self._stop.requested:
-            raise Interrupted(f"interrupted after {result['frames']} frames")
-        stats = self._link.stats
-        if stats.refused + stats.send_failed > result["frames"] // 2:
+        result = self._result(wall_ns) | {"realtime": [msgspec.to_builtins(setting) for setting in settings]}
+        if self._refused > result["frames"] // 2:
             raise PeerMissingError(
-                f"nobody listens at {self._link.uri} ({stats.refused + stats.send_failed} of {result['frames']} frames "
-                "were refused): start the receiver first, or correct the address"
+                f"nobody listens at {self._link.uri} ({self._refused} of {result['frames']} frames were refused): start the "
+                "receiver first, or correct the address"
             )
         return result
 
+    @property
+    def _refused(self) -> int:
+        return self._link.stats.refused + self._link.stats.send_failed
+
     def _prepare(self, number: int, passes: int) -> bytes:
-        frame = self._data[self._begins[number] : self._ends[number]]
-        if self._mover:
+        frame = bytes(self._data[self._begins[number] : self._ends[number]])
+        if self._mover and self._known[number]:
             frame = self._mover.move(frame, passes * self._pass_us)
-        return self._signer.sign(frame, unix_time_us()) if self._signer else frame
+        if self._signer and self._known[number]:
+            return self._signer.sign(frame, unix_time_us())
+        self._not_signed += self._signer is not None
+        return frame
 
     def _attend(self, player: Player) -> None:
         """Look after all but the frames: the wish to stop, keys, what the receiver says, the display."""
@@ -136,6 +160,9 @@ class Replay:
         for _ in range(_DRAIN_LIMIT):
             if not self._link.recv(0.0):
                 break
+        if self._refused and not self._told_of_refusal:
+            self._told_of_refusal = True
+            self._display.say(f"nobody listens at {self._link.uri}, or not always: frames are refused")
         self._display.show(player, self._stamps_us)
 
     def _result(self, wall_ns: int) -> dict[str, Any]:
@@ -143,18 +170,19 @@ class Replay:
         log_s = player.passes * span_s + (player.log_ns * 1e-9 if player.at < len(self._begins) else 0.0)
         return {
             "log": str(self._scan.path),
+            "interrupted": self._stop.requested,
             "to": self._link.uri,
             "frames": player.sent,
             "passes": player.passes,
             "log_s": log_s,
             "wall_s": wall_ns * 1e-9,
             "speed": self._options.speed,
-            "speed_measured": log_s / (wall_ns * 1e-9) if wall_ns else None,
+            "speed_measured": log_s / (wall_ns * 1e-9) if wall_ns and not player.moved else None,
             "lateness_us": percentiles_us(player.lateness_ns),
             "counters": {
                 "times_moved": self._mover.moved if self._mover else 0,
                 "signed": self._signer.signed if self._signer else 0,
-                "not_signed": self._signer.unsigned if self._signer else 0,
+                "not_signed": self._not_signed + (self._signer.unsigned if self._signer else 0),
                 **self._link.stats.as_dict(),
             },
         }
@@ -163,13 +191,16 @@ class Replay:
 class _Display:
     """Log time in a bar on a terminal, a line now and then elsewhere."""
 
-    def __init__(self, frames: int) -> None:
+    def __init__(self, frames: int, clock: Clock) -> None:
         self._frames = frames
+        self._clock = clock
+        self._drawn_ns = clock.now_ns()
         self._line = StatusLine()
         self._bar: Bar | None = None
         if sys.stderr.isatty():
             columns = (TextColumn("replaying"), BarColumn(bar_width=30), TextColumn("{task.description}"))
-            self._bar = Bar(*columns, console=Console(stderr=True))
+            # Drawn by hand: the thread that would draw it holds the interpreter when a frame is due.
+            self._bar = Bar(*columns, console=Console(stderr=True), auto_refresh=False)
             self._task = self._bar.add_task("", total=frames)
 
     def say(self, text: str) -> None:
@@ -182,6 +213,10 @@ class _Display:
         )
         if self._bar:
             self._bar.update(self._task, completed=player.at, description=text)
+            since_ns = self._clock.now_ns() - self._drawn_ns
+            if since_ns > _DRAW_PERIOD_NS and (player.room_ns > _DRAW_ROOM_NS or since_ns > 5 * _DRAW_PERIOD_NS):
+                self._bar.refresh()
+                self._drawn_ns = self._clock.now_ns()
         else:
             self._line.show(text)
 
@@ -192,6 +227,7 @@ class _Display:
 
     def __exit__(self, *_: object) -> None:
         if self._bar:
+            self._bar.refresh()
             self._bar.stop()
 
 

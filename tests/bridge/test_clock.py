@@ -90,6 +90,34 @@ def test_a_stamp_is_a_date_a_time_and_a_name_that_any_file_system_takes() -> Non
     assert set(stamp) <= set("0123456789-T")
 
 
+class Machine:
+    """A machine whose sleeps end too late by `overslept_ns`."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_ns = self.overslept_ns = self.slept_ns = 0
+        monkeypatch.setattr(time, "sleep", self._sleep)
+        monkeypatch.setattr(time, "monotonic_ns", self._read)
+
+    def _sleep(self, wait_s: float) -> None:
+        self.slept_ns += round(wait_s * 1e9)
+        self.now_ns += round(wait_s * 1e9) + self.overslept_ns
+
+    def _read(self) -> int:
+        self.now_ns += 20_000  # a look at the clock takes its time
+        return self.now_ns
+
+    def lateness_ns(self, clock: PunctualClock, wait_ns: int = 50_000_000) -> int:
+        """How late a wait ends."""
+        deadline_ns = self.now_ns + wait_ns
+        clock.sleep_until_ns(deadline_ns)
+        return self.now_ns - deadline_ns
+
+
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
+    return Machine(monkeypatch)
+
+
 class TestPunctualClock:
     def test_it_is_on_time_and_never_early(self) -> None:
         clock = PunctualClock()
@@ -98,36 +126,29 @@ class TestPunctualClock:
             clock.sleep_until_ns(deadline_ns)
             assert clock.now_ns() >= deadline_ns
 
-    def test_the_later_the_machine_wakes_it_the_earlier_it_wakes(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        now_ns, overslept_ns = 0, 0
-
-        def sleep(wait_s: float) -> None:
-            nonlocal now_ns
-            now_ns += round(wait_s * 1e9) + overslept_ns
-
-        def read() -> int:
-            nonlocal now_ns
-            now_ns += 20_000  # a look at the clock takes its time
-            return now_ns
-
-        monkeypatch.setattr(time, "sleep", sleep)
-        monkeypatch.setattr(time, "monotonic_ns", read)
+    def test_the_later_the_machine_wakes_it_the_earlier_it_wakes(self, machine: Machine) -> None:
         clock = PunctualClock()
-
-        def lateness_ns() -> int:
-            deadline_ns = now_ns + 50_000_000
-            clock.sleep_until_ns(deadline_ns)
-            return now_ns - deadline_ns
-
-        assert lateness_ns() <= 40_000
-        overslept_ns = 3_000_000
-        assert lateness_ns() > 2_000_000
-        assert lateness_ns() <= 40_000
-        overslept_ns = 0
+        assert machine.lateness_ns(clock) <= 40_000
+        machine.overslept_ns = 3_000_000
+        assert machine.lateness_ns(clock) > 2_000_000
+        assert machine.lateness_ns(clock) <= 40_000
+        machine.overslept_ns = 0
         for _ in range(1200):
-            lateness_ns()
-        overslept_ns = 3_000_000
-        assert lateness_ns() > 2_000_000, "it has come to trust the machine again"
+            machine.lateness_ns(clock)
+        machine.overslept_ns = 3_000_000
+        assert machine.lateness_ns(clock) > 2_000_000, "it has come to trust the machine again"
+
+    @pytest.mark.parametrize("wait_ns", [200_000, 4_000_000, 50_000_000])
+    def test_a_real_time_thread_sleeps_through_half_of_each_wait(self, machine: Machine, wait_ns: int) -> None:
+        clock = PunctualClock(sleeps_half=True)
+        machine.overslept_ns = 15_000_000
+        machine.lateness_ns(clock)
+        machine.overslept_ns = 0
+        machine.slept_ns = 0
+        assert machine.lateness_ns(clock, wait_ns) <= 40_000
+        # At most it wakes 20 ms early, so of a long wait it sleeps more.
+        assert machine.slept_ns == pytest.approx(max(wait_ns / 2, wait_ns - 20e6), abs=200_000)
+        assert machine.slept_ns >= wait_ns // 2 - 40_000
 
 
 class TestUnixOffset:

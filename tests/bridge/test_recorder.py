@@ -141,7 +141,7 @@ class TestLog:
         for frames in sets:
             assert [raw for raw in found if raw in set(frames)] == frames
 
-    @pytest.mark.parametrize("name", ["a.tlog", "a.tlog.json"])
+    @pytest.mark.parametrize("name", ["a.tlog", "a.tlog.json", "a.tlog.links"])
     def test_nothing_that_is_there_is_overwritten(self, name: str, tmp_path: Path) -> None:
         refuse_existing_log(tmp_path / "a.tlog")
         (tmp_path / name).write_text("kept")
@@ -157,7 +157,7 @@ class TestDiskThatRefuses:
 
     def test_a_sidecar_that_cannot_be_written_leaves_no_log_behind(self, tmp_path: Path) -> None:
         sidecar_path(tmp_path / "a.tlog").mkdir()
-        with pytest.raises(RunFolderError, match="cannot write beside the log"):
+        with pytest.raises(RunFolderError, match="cannot begin the log"):
             recorder(tmp_path / "a.tlog")
         assert not (tmp_path / "a.tlog").exists()
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.clock import VirtualClock
-from bridge.replay import LOOK_PERIOD_NS, Player, log_times_ns
+from bridge.replay import LATEST_LOOK_NS, LOOK_PERIOD_NS, LOOK_ROOM_NS, Player, log_times_ns
 
 MS = 1_000_000
 TICKS_NS = np.arange(100, dtype=np.int64) * 4 * MS
@@ -54,22 +54,22 @@ class TestTime:
         stage.player.play()
         assert stage.times_ns() == [round(t_ns / speed) for t_ns in TICKS_NS.tolist()]
         assert stage.numbers() == list(range(100))
-        assert stage.player.lateness_ns == [0] * 100
+        assert stage.player.lateness_ns.tolist() == [0] * 100
 
     def test_as_fast_as_it_goes_takes_no_time(self) -> None:
         stage = Stage(speed=None)
         stage.player.play()
         assert stage.times_ns() == [0] * 100
-        assert stage.player.lateness_ns == []
+        assert stage.player.lateness_ns.tolist() == []
 
     def test_lateness_is_told_and_never_adds_up(self) -> None:
         # Each send takes 6 ms, while frames are due each 4 ms: then ten times slower, and it is in time again.
         slow = Stage(speed=1.0, send_takes_ns=6 * MS)
         slow.player.play()
-        assert slow.player.lateness_ns == [2 * MS * k for k in range(100)]
+        assert slow.player.lateness_ns.tolist() == [2 * MS * k for k in range(100)]
         leisurely = Stage(speed=0.1, send_takes_ns=6 * MS)
         leisurely.player.play()
-        assert leisurely.player.lateness_ns == [0] * 100
+        assert leisurely.player.lateness_ns.tolist() == [0] * 100
 
     def test_frames_of_one_stamp_go_together_and_in_order(self) -> None:
         stage = Stage(np.repeat(TICKS_NS, 3))
@@ -89,6 +89,52 @@ class TestTime:
         for step_ns, before, after in zip(steps.tolist(), stamps, stamps[1:], strict=False):
             expected = max(0, after - before) * 1000
             assert step_ns == (expected if most is None else min(expected, most))
+
+
+class LateClock(VirtualClock):
+    """Sleeps end 1 us late, as they do."""
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        if t_ns > self.now_ns():
+            super().sleep_until_ns(t_ns + 1_000)
+
+
+class TestLooks:
+    """A look takes time, which must not be that of a frame."""
+
+    LOOK_TAKES_NS = LOOK_ROOM_NS * 9 // 10
+
+    def played(self, times_ns: np.typing.NDArray[np.int64]) -> tuple[list[int], list[int]]:
+        """When looks began, and how late frames were."""
+        looks: list[int] = []
+        clock = LateClock(0)
+
+        def look(_: Player) -> None:
+            looks.append(clock.now_ns())
+            clock.advance_ns(self.LOOK_TAKES_NS)
+
+        player = Player(times_ns, lambda *_: b"", lambda _: None, clock, speed=1.0, look=look)
+        player.play()
+        return looks, player.lateness_ns.tolist()
+
+    @given(st.lists(st.integers(LOOK_ROOM_NS, 40 * MS), min_size=1, max_size=60))
+    def test_where_there_is_room_no_frame_waits_for_one(self, steps_ns: list[int]) -> None:
+        looks, lateness_ns = self.played(np.cumsum([0, *(step + LOOK_ROOM_NS // 10 for step in steps_ns)]))
+        assert max(lateness_ns) <= 1_000
+        assert max(np.diff(looks), default=0) <= LOOK_PERIOD_NS + 40 * MS
+
+    @pytest.mark.parametrize("offset_ns", [0, 1, 999, 1_000, 1_001])
+    def test_a_look_that_just_fits_or_just_does_not_holds_nothing_up(self, offset_ns: int) -> None:
+        first_look_ns = self.LOOK_TAKES_NS  # the one before the first frame; further ones a period after it begins
+        due_ns = LOOK_PERIOD_NS + LOOK_ROOM_NS + offset_ns - first_look_ns
+        _, lateness_ns = self.played(np.array([0, due_ns, due_ns + 4 * MS], dtype=np.int64))
+        assert max(lateness_ns) <= 1_000
+
+    def test_without_room_they_come_ten_times_a_second_all_the_same(self) -> None:
+        looks, lateness_ns = self.played(np.arange(2000, dtype=np.int64) * (LOOK_ROOM_NS // 2))
+        assert LOOK_PERIOD_NS < np.diff(looks).max() <= LOOK_PERIOD_NS + LATEST_LOOK_NS + LOOK_ROOM_NS
+        assert len(looks) == 10
+        assert max(lateness_ns) <= self.LOOK_TAKES_NS
 
 
 class TestHand:
@@ -137,6 +183,17 @@ class TestHand:
         numbers = stage.numbers()
         assert numbers == [*range(6), *range(expected, 100)]
         assert stage.times_ns()[6] == LOOK_PERIOD_NS, "at once"
+
+    @pytest.mark.parametrize("move", [lambda p: p.seek(0.1), lambda p: p.hold(), lambda p: p.step()])
+    def test_it_says_that_it_was_moved(self, move: Callable[[Player], None]) -> None:
+        def look(player: Player) -> None:
+            move(player)
+            player.stop()
+
+        untouched, touched = Stage(), Stage(look=look)
+        for stage in (untouched, touched):
+            stage.player.play()
+        assert (untouched.player.moved, touched.player.moved) == (False, True)
 
     def test_it_stops_before_the_next_frame(self) -> None:
         stage = Stage(look=lambda player: player.stop() if player.sent else None)

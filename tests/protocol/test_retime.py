@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import common
 from protocol.errors import UsageError
 from protocol.log_scan import Scan, scan_tlog
 from protocol.mavlink_codec import FrameWriter, layout
-from protocol.retime import TIME_FIELDS, Signer, TimeMover, read_key, time_fields, unsigned
+from protocol.retime import TIME_FIELDS, Signer, TimeMover, read_key, time_fields
 
 KEY = bytes(range(32))
 NOW_US = 1_795_000_000_000_000
@@ -41,6 +41,10 @@ def moved(*frames: bytes, extra_us: int = 0) -> list[Any]:
     scan = log_of(*frames)
     mover = TimeMover(scan, np.ones(len(scan), dtype=np.bool_), NOW_US)
     return [decoded(mover.move(frame, extra_us)) for frame in frames]
+
+
+def unsigned(frame: bytes) -> bool:
+    return frame[0] == 0xFE or not frame[2] & 1
 
 
 def decoded(frame: bytes, key: bytes | None = None) -> Any:

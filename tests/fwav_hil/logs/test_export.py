@@ -15,6 +15,7 @@ from mcap.reader import make_reader
 from fwav_hil.logs import export
 from protocol.log_files import open_log
 from tests.fwav_hil.logs.conftest import COUNT, Shell, flight
+from tests.protocol.log_records import FOREIGN
 
 NAMES = ["ATT_POS_MOCAP", "HIL_ACTUATOR_CONTROLS", "STATUSTEXT"]
 
@@ -101,6 +102,44 @@ def test_the_schema_says_types_and_units(flight_log: Path) -> None:
         "covariance": {"type": "array", "items": {"type": "number"}},
     }
     assert schema("STATUSTEXT", made["STATUSTEXT"])["properties"]["text"] == {"type": "string"}
+
+
+@pytest.mark.parametrize("kind", ["parquet", "csv", "mcap"])
+class TestChoice:
+    @pytest.mark.parametrize(
+        ("options", "counts"),
+        [
+            (("--types", "att_pos_mocap"), {"ATT_POS_MOCAP": COUNT}),
+            (("--system", "1/1"), {"HIL_ACTUATOR_CONTROLS": COUNT, "STATUSTEXT": 1}),
+            (("--from", "0.5", "--to", "0.9"), {"ATT_POS_MOCAP": 5, "HIL_ACTUATOR_CONTROLS": 5}),
+            (("--to", "22:13:20.2", "--system", "1/191"), {"ATT_POS_MOCAP": 3}),
+        ],
+    )
+    def test_a_part_of_a_log(
+        self, shell: Shell, flight_log: Path, kind: str, options: tuple[str, ...], counts: dict[str, int]
+    ) -> None:
+        ended = shell("export", flight_log, "--to", kind, *options, "--json", "-", "--out", "part")
+        assert ended.code == 0
+        assert json.loads(ended.out)["messages"] == counts
+
+    def test_a_part_without_a_message_is_an_error(
+        self, shell: Shell, flight_log: Path, tmp_path: Path, kind: str
+    ) -> None:
+        ended = shell("export", flight_log, "--to", kind, "--system", "9", "--out", "part")
+        assert (ended.code, ended.out) == (2, "")
+        assert "no frame of" in ended.err
+        assert not (tmp_path / "part").exists()
+
+    def test_what_nobody_knows_has_no_table(self, shell: Shell, mixed_log: Path, kind: str) -> None:
+        ended = shell("export", mixed_log, "--to", kind, "--types", f"UNKNOWN_{FOREIGN[0]}")
+        assert (ended.code, ended.out) == (2, "")
+        assert "nothing says what is in UNKNOWN_" in ended.err
+
+    @pytest.mark.parametrize("more", [("--to", "1", "--to", "2"), ("--to", "csv")])
+    def test_said_twice_it_is_refused(self, shell: Shell, flight_log: Path, kind: str, more: tuple[str, ...]) -> None:
+        ended = shell("export", flight_log, "--to", kind, *more)
+        assert (ended.code, ended.out) == (2, "")
+        assert "say what to write once: --to parquet, csv, mcap" in ended.err
 
 
 @pytest.mark.parametrize("kind", ["parquet", "csv", "mcap"])

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from bridge.recorder import Recorder
+from bridge.sidecar import LinkOfLog
 from tests.fwav_hil.logs.conftest import COUNT, Shell, flight
-from tests.protocol.log_records import DAY_US, FOREIGN
+from tests.protocol.log_records import DAY_US, FOREIGN, Pen
 
 
 def test_what_a_flight_holds(shell: Shell, flight_log: Path) -> None:
@@ -61,6 +63,52 @@ def test_damage_unknown_messages_versions_and_signatures(shell: Shell, mixed_log
     assert by_system[1]["signed"] == 0
     assert f"UNKNOWN_{FOREIGN[0]}" in {row["name"] for row in info["types"]}
     assert "crc_failures 2" in shell("info", mixed_log).out
+
+
+def test_of_a_recording_the_links_the_directions_and_whether_it_is_whole(shell: Shell, tmp_path: Path) -> None:
+    links = (LinkOfLog("udpin://a", "127.0.0.1:1", ((1, 191),)), LinkOfLog("serial://b"))
+    with Recorder(tmp_path / "a.tlog", links, stamps="Unix time", source={"scenario": "flapper", "seed": 3}) as log:
+        for row, record in enumerate(flight()):  # in turn of 1/191 and of 1/1
+            log.write(record.t_us, record.frame, int(row >= 60))
+        log.close()
+        said = shell("info", "a.tlog", "--json", "-")
+        recording = json.loads(said.out)["recording"]
+        assert recording["links"] == [
+            {"uri": "udpin://a", "peer": "127.0.0.1:1", "sent": 30, "received": 30},
+            {"uri": "serial://b", "peer": "", "sent": 0, "received": 41},
+        ]
+        assert (recording["complete"], recording["lost"], recording["scenario"], recording["seed"]) == (
+            True,
+            0,
+            "flapper",
+            3,
+        )
+        assert "link udpin://a (127.0.0.1:1): 30 frames sent, 30 received" in said.err
+        assert "of flapper, complete; stamps are Unix time" in said.err
+
+
+def test_a_recording_that_was_killed_is_not_called_whole(shell: Shell, tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.tlog", (LinkOfLog("mem://a"),), stamps="Unix time", source={}) as log:
+        log.write(DAY_US, flight()[0].frame)
+        log.close()
+    content = json.loads((tmp_path / "a.tlog.json").read_text()) | {"complete": False, "lost": None}
+    (tmp_path / "a.tlog.json").write_text(json.dumps(content))
+    assert "not complete: it was cut short, or is still being written" in shell("info", "a.tlog").out
+    (tmp_path / "a.tlog.json").write_text(json.dumps(content | {"lost": 7, "error": "disk full"}))
+    assert "not complete: 7 frames are missing (disk full)" in shell("info", "a.tlog").out
+    for nonsense in ("{", '{"format": "other"}'):
+        (tmp_path / "a.tlog.json").write_text(nonsense)
+        ended = shell("info", "a.tlog", "--json", "-")
+        assert (ended.code, json.loads(ended.out)["recording"]) == (0, None)
+
+
+def test_long_names_are_whole_where_there_is_no_terminal(
+    shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("COLUMNS")
+    pen = Pen()
+    (tmp_path / "a.tlog").write_bytes(b"".join(pen.record(85).data for _ in range(3)))
+    assert "POSITION_TARGET_LOCAL_NED " in shell("info", "a.tlog").out
 
 
 def test_a_run_folder_stands_for_its_log(shell: Shell, flight_log: Path, tmp_path: Path) -> None:

@@ -7,10 +7,12 @@ import struct
 from pathlib import Path
 from typing import Any
 
+import fastcrc
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import matrixpilot
 
 from fwav_hil.replay.diff import LogDifference, Tolerances, compare_logs, parse_tolerances
 from protocol.errors import UsageError
@@ -18,6 +20,7 @@ from protocol.log_scan import Scan, scan_tlog
 from protocol.mavlink_codec import FrameWriter, layout
 from protocol.tlog import TlogWriter, read_tlog
 from tests.fwav_hil.replay.conftest import Command
+from tests.protocol.log_records import FOREIGN, Pen
 
 EXACT = Tolerances()
 
@@ -103,6 +106,47 @@ class TestPairs:
         assert field(difference, "eph").largest == 65534.0
         assert not field(difference, "eph").beyond
         assert field(difference, "text").beyond == 1
+
+    @pytest.mark.parametrize(
+        ("message", "name", "one", "two", "apart"),
+        [
+            ("HIL_GPS", "vn", -20_000, 20_000, 40_000.0),  # more than an int16 holds
+            ("GLOBAL_POSITION_INT", "lat", 2**31 - 1, -(2**31), 2.0**32 - 1),
+            ("SCALED_IMU", "xacc", -32_768, 32_767, 65_535.0),
+            ("TIMESYNC", "tc1", -(2**63), 2**63 - 1, 2.0**64),
+            ("TIMESYNC", "tc1", -5, -3, 2.0),
+        ],
+    )
+    def test_signed_numbers_at_the_two_ends_of_their_kind(
+        self, message: str, name: str, one: int, two: int, apart: float
+    ) -> None:
+        for pair in ((one, two), (two, one)):
+            logs = [Log().add(message, **{name: value}).scan for value in pair]
+            found = field(compare_logs(logs[0], logs[1], Tolerances(1.0)), name)
+            assert (found.largest, found.beyond) == (apart, 1)
+
+    def test_messages_that_the_dialect_lacks_are_compared_by_their_bytes(self) -> None:
+        def log(change: int, count: int) -> Scan:
+            pen = Pen(matrixpilot)
+            data = bytearray(b"".join(pen.record(FOREIGN[0]).data for _ in range(count)))
+            scan = scan_tlog(bytes(data))
+            assert scan.counters["unknown_frames"] == count
+            if change:  # a payload, and the checksum made to fit with the seed that is right for it
+                at = int(scan.frames["offset"][3])
+                end = at + 10 + data[at + 1]
+                data[at + 12] ^= change
+                seed = bytes([matrixpilot.mavlink_map[FOREIGN[0]].crc_extra])
+                data[end : end + 2] = fastcrc.crc16.mcrf4xx(bytes(data[at + 1 : end]) + seed).to_bytes(2, "little")
+            return scan_tlog(bytes(data))
+
+        same = compare_logs(log(0, 9), log(0, 9), EXACT)
+        assert same.is_same
+        assert field(same, "payload").pairs == 9
+        changed = compare_logs(log(0, 9), log(1, 8), Tolerances(1e9))
+        assert (field(changed, "payload").pairs, field(changed, "payload").beyond) == (8, 1)
+        assert changed.only_first == {f"UNKNOWN_{FOREIGN[0]} {field(changed, 'payload').sender}": 1}
+        assert not changed.is_same
+        assert not compare_logs(log(0, 9), log(1, 9), EXACT, ["ATTITUDE"]).fields
 
     def test_nothing_compared_is_not_the_same(self) -> None:
         assert not compare_logs(attitudes({0: 1.0}).scan, attitudes({4: 1.0}).scan, EXACT).is_same
@@ -190,8 +234,8 @@ class TestCommand:
         ("second", "arguments", "code", "words"),
         [
             ("nowhere.tlog", (), 2, "nowhere.tlog"),
-            ("text.tlog", (), 6, "is no telemetry log"),
-            ("run", ("--types", "GPS_RAW_INT"), 2, "no frame of"),
+            ("text.tlog", (), 6, "holds no message"),
+            ("run", ("--types", "GPS_RAW_INT"), 2, "holds no such message"),
             ("run", ("--tolerance", "what=ever"), 2, "--tolerance what=ever"),
         ],
     )
