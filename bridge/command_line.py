@@ -105,6 +105,15 @@ spin_option = click.option(
     "each answer.",
 )  # fmt: skip
 
+station_option = click.option(
+    "--station", metavar="URI",
+    help="A ground station's link, besides the loop's: udpout://127.0.0.1:14550, udpin://, tcpin:// (docs/station.md).",
+)  # fmt: skip
+truth_option = click.option(
+    "--truth", "truth_hz", type=click.FloatRange(min=0.1), metavar="HZ",
+    help="Say the true state on the link, and so in the log, at this rate: HIL_STATE_QUATERNION and ODOMETRY.",
+)  # fmt: skip
+
 process_options = options(
     click.option("--status", type=click.Choice(["text", "jsonl"]), default="text", hidden=True),
     click.option("--core", type=int, hidden=True),

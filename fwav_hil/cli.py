@@ -28,6 +28,7 @@ from bridge.command_line import (
     seed_option,
     spin_option,
     trigger_option,
+    truth_option,
     wait_option,
 )
 from bridge.option_types import check_speed, speed_option
@@ -127,6 +128,11 @@ plots_option = click.option("--plots/--no-plots", default=True, show_default=Tru
     delay_option,
     legs_option,
     run_motor_options,
+    truth_option,
+    click.option(
+        "--emulator-station", metavar="URI",
+        help="A ground station's link to the emulator: the true state and the drives' speed, on request (docs/station.md).",
+    ),
     wait_option,
     out_option,
     log_error_option,
@@ -154,6 +160,8 @@ def run_command(
     feedback: str,
     can_log: Path | None,
     tap: str | None,
+    truth_hz: float | None,
+    emulator_station: str | None,
     wait_s: float,
     out: Path | None,
     on_log_error: str,
@@ -195,7 +203,8 @@ def run_command(
     try:
         run_options = RunOptions(
             clock=clock, link=link, speed=speed, wait_s=wait_s, delay_ns=delay_ns, legs=legs, on_log_error=on_log_error,
-            motors=motors, realtime=realtime, trigger=trigger, spin_us=spin_us,
+            motors=motors, realtime=realtime, trigger=trigger, spin_us=spin_us, truth_hz=truth_hz,
+            emulator_station=emulator_station,
         )  # fmt: skip
         run(chosen, folder, run_options)
     except FwavHilError:

@@ -49,7 +49,7 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     """How the run is made. link: the emulator's URI; the controller gets its counterpart.
 
     show_progress: False where the caller shows its own, and wants no line on the budget. delay_ns, legs: see
-    `EmulatorOptions`. realtime, trigger, spin_us: see the commands' options.
+    `EmulatorOptions`, and so is truth_hz; emulator_station: its `station`. realtime, trigger, spin_us: see the commands' options.
     """
 
     clock: str = "lockstep"
@@ -64,6 +64,8 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     delay_ns: int = 0
     legs: bool = False
     on_log_error: str = "stop"
+    emulator_station: str | None = None
+    truth_hz: float | None = None
 
 
 class RunFailedError(FwavHilError):
@@ -156,6 +158,10 @@ def _start(folder: Path, options: RunOptions, placement: Placement) -> tuple[Chi
         flight += ["--delay", f"{options.delay_ns}ns"]
     if options.motors:
         flight += options.motors.emulator_arguments
+    if options.truth_hz:
+        flight += ["--truth", str(options.truth_hz)]
+    if options.emulator_station:
+        flight += ["--station", options.emulator_station]
     answers = ["--link", "-", "--arm", "--trigger", options.trigger]
     return (
         Child("plant_emulator", [*common, *placement.emulator, *flight]),

@@ -22,6 +22,8 @@ from bridge.command_line import (
     scenario_argument,
     seed_option,
     spin_option,
+    station_option,
+    truth_option,
     wait_option,
 )
 from bridge.link import refuse_rate_that_cannot_fit
@@ -54,6 +56,8 @@ Example:
     delay_option,
     legs_option,
     wait_option,
+    station_option,
+    truth_option,
     run_motor_options,
     click.option(
         "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
@@ -76,6 +80,8 @@ def emulator(
     delay_ns: int,
     legs: bool,
     wait_s: float,
+    station: str | None,
+    truth_hz: float | None,
     motor: str,
     can: str,
     protocol: str | None,
@@ -103,8 +109,7 @@ def emulator(
     run_options = EmulatorOptions(
         link=link, clock=clock, speed=speed, out=out, wait_s=wait_s, spin_s=None if spin_us is None else spin_us * 1e-6,
         realtime=realtime, core=own_core(0) if core is None else core, delay_ns=delay_ns, legs=legs,
-        on_log_error=on_log_error,
-        motors=motors,
+        on_log_error=on_log_error, motors=motors, station=station, truth_hz=truth_hz,
     )  # fmt: skip
     summary = run_emulator(chosen, run_options, report, stop)
     show_json(json_path, {"scenario": chosen.name, "rate_hz": chosen.rate_hz, "seed": chosen.seed, **summary})

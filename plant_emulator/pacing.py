@@ -168,6 +168,7 @@ class Lockstep(Pacing):
             for frame in frames:
                 received.append(frame)
                 if frame.message_id != mavlink_map.COMMAND.message_id or (frame.system, frame.component) != VEHICLE:
+                    self.emulator.take_request(frame)
                     continue
                 command = self.emulator.decode(frame.payload)
                 if command is not None and command.t_ns == t_ns:
@@ -209,9 +210,10 @@ class Lockstep(Pacing):
     def _accept(self, tick: int, t_us: int, frames: list[Frame]) -> None:
         """Log the frames of an answer. Numbers restart at t = 0, so the first answer's own tells how many belong to it."""
         if tick == 0:
-            belonging = frames[-(frames[-1].sequence + 1) :]
-            self.counters["foreign"] += len(frames) - len(belonging)
-            frames = belonging
+            theirs = [frame for frame in frames if (frame.system, frame.component) == VEHICLE]
+            strays = {id(frame) for frame in theirs[: -(frames[-1].sequence + 1)]}
+            self.counters["foreign"] += len(strays)
+            frames = [frame for frame in frames if id(frame) not in strays]
             self.endpoint.reader.restart_sequences([(*VEHICLE, frames[-1].sequence + 1)])
         self.owe_log(t_us, [frame.raw for frame in frames])
 
@@ -363,6 +365,8 @@ class RealTime(Pacing):
     def _take(self, frame: Frame, arrival_ns: int, wall_ns: int, stamp_ns: int) -> None:
         """Take a frame that came at simulation time arrival_ns, wall_ns of this machine, and was stamped then (0: not)."""
         self.owe_log(self._unix_us(wall_ns), [frame.raw])
+        if self.emulator.take_request(frame):
+            return
         if (frame.system, frame.component) != VEHICLE:
             return
         self._heard_ns = self.clock.now_ns()

@@ -56,8 +56,23 @@ STREAMS = (
         None,
         "on the tap's own link (`--tap`): the motor bus, while 32000 is renewed within 5 s",
     ),
-    Stream("COMMAND_LONG", End.STATION, None, "to the controller: 400 (arm, disarm)"),
-    Stream("COMMAND_ACK", End.CONTROLLER, None, "the answer to it"),
+    Stream(
+        "HIL_STATE_QUATERNION", End.EMULATOR, None, "the true state, on request (511, 512, `--truth`); no law reads it"
+    ),
+    Stream("ODOMETRY", End.EMULATOR, None, "the same to the full: float metres, body rates"),
+    Stream(
+        "RAW_RPM",
+        End.EMULATOR,
+        None,
+        "drives on a bus: how fast each says it turns; 10 Hz to a ground station, or on request",
+    ),
+    Stream(
+        "COMMAND_LONG",
+        End.STATION,
+        None,
+        "400 (arm, disarm) to the controller; 511, 512 (a message at a rate, once) and 32000 (CAN) to the emulator",
+    ),
+    Stream("COMMAND_ACK", End.BOTH, None, "the answer to it"),
 )
 
 
