@@ -27,6 +27,7 @@ from bridge.command_line import (
     scenario_argument,
     seed_option,
     spin_option,
+    station_option,
     trigger_option,
     truth_option,
     wait_option,
@@ -129,6 +130,7 @@ plots_option = click.option("--plots/--no-plots", default=True, show_default=Tru
     legs_option,
     run_motor_options,
     truth_option,
+    station_option,
     click.option(
         "--emulator-station", metavar="URI",
         help="A ground station's link to the emulator: the true state and the drives' speed, on request (docs/station.md).",
@@ -161,6 +163,7 @@ def run_command(
     can_log: Path | None,
     tap: str | None,
     truth_hz: float | None,
+    station: str | None,
     emulator_station: str | None,
     wait_s: float,
     out: Path | None,
@@ -204,7 +207,7 @@ def run_command(
         run_options = RunOptions(
             clock=clock, link=link, speed=speed, wait_s=wait_s, delay_ns=delay_ns, legs=legs, on_log_error=on_log_error,
             motors=motors, realtime=realtime, trigger=trigger, spin_us=spin_us, truth_hz=truth_hz,
-            emulator_station=emulator_station,
+            station=station, emulator_station=emulator_station,
         )  # fmt: skip
         run(chosen, folder, run_options)
     except FwavHilError:

@@ -49,7 +49,8 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     """How the run is made. link: the emulator's URI; the controller gets its counterpart.
 
     show_progress: False where the caller shows its own, and wants no line on the budget. delay_ns, legs: see
-    `EmulatorOptions`, and so is truth_hz; emulator_station: its `station`. realtime, trigger, spin_us: see the commands' options.
+    `EmulatorOptions`, as for truth_hz; station: the controller's, emulator_station: the emulator's `station`. realtime,
+    trigger, spin_us: see the commands' options.
     """
 
     clock: str = "lockstep"
@@ -64,6 +65,7 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     delay_ns: int = 0
     legs: bool = False
     on_log_error: str = "stop"
+    station: str | None = None
     emulator_station: str | None = None
     truth_hz: float | None = None
 
@@ -163,6 +165,7 @@ def _start(folder: Path, options: RunOptions, placement: Placement) -> tuple[Chi
     if options.emulator_station:
         flight += ["--station", options.emulator_station]
     answers = ["--link", "-", "--arm", "--trigger", options.trigger]
+    answers += ["--station", options.station] if options.station else []
     return (
         Child("plant_emulator", [*common, *placement.emulator, *flight]),
         Child("controller", [*common, *placement.controller, *answers]),

@@ -298,11 +298,16 @@ def heartbeat_is_ending(payload: bytes) -> bool:
     return bool(HEARTBEAT.unpack_fields(payload)["system_status"] == common.MAV_STATE_POWEROFF)
 
 
-def encode_version(digest: bytes) -> bytes:
-    """AUTOPILOT_VERSION payload with the scenario's digest (8 bytes) as flight_custom_version."""
-    return VERSION.pack_fields(
-        capabilities=common.MAV_PROTOCOL_CAPABILITY_MAVLINK2, flight_custom_version=digest, flight_sw_version=1 << 16
-    )
+def encode_version(digest: bytes, *, has_parameters: bool = False) -> bytes:
+    """AUTOPILOT_VERSION payload with the scenario's digest (8 bytes) as flight_custom_version.
+
+    has_parameters: the sender has some, floats as floats and integers bytewise.
+    """
+    capabilities = common.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    if has_parameters:
+        capabilities |= common.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+        capabilities |= common.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    return VERSION.pack_fields(capabilities=capabilities, flight_custom_version=digest, flight_sw_version=1 << 16)
 
 
 def decode_version(payload: bytes) -> bytes:

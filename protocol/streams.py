@@ -48,6 +48,17 @@ STREAMS = (
     Stream("POSITION_TARGET_LOCAL_NED", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
     Stream("ATTITUDE_TARGET", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
     Stream(
+        "PARAM_VALUE",
+        End.CONTROLLER,
+        None,
+        "gains, scales, limits, gears: each once at the start, for the log, and when changed; to a ground station on request",
+    ),
+    Stream("PARAM_REQUEST_LIST", End.STATION, None, "to the controller, on its station's link: all of them"),
+    Stream("PARAM_REQUEST_READ", End.STATION, None, "one of them"),
+    Stream("PARAM_SET", End.STATION, None, "a gain, while disarmed"),
+    Stream("PARAM_ERROR", End.CONTROLLER, None, "why one was not given or not set"),
+    Stream("FILE_TRANSFER_PROTOCOL", End.CONTROLLER, None, "the refusal of files, for which stations ask first"),
+    Stream(
         "TIMESYNC", End.BOTH, 1.0, "real time only: how far the other end's clock is ahead; 20 Hz for the first ten"
     ),
     Stream(

@@ -48,6 +48,7 @@ def fly_both(
     spin_s: float | None = None,
     station: str | None = None,
     truth_hz: float | None = None,
+    controller_station: str | None = None,
 ) -> Ends:
     """Run both ends to their end."""
     theirs = controller_scenario or scenario
@@ -56,8 +57,9 @@ def fly_both(
         truth_hz=truth_hz,
     )  # fmt: skip
     service_options = ControllerOptions(
-        link="-", clock=clock, out=out, wait_s=wait_s, arm=arm, legs=legs, trigger=trigger, spin_s=spin_s
-    )
+        link="-", clock=clock, out=out, wait_s=wait_s, arm=arm, legs=legs, trigger=trigger, spin_s=spin_s,
+        station=controller_station,
+    )  # fmt: skip
     law = make_law(theirs.law, theirs)
     plant_emulator.process.warm_up(scenario)
     controller_process.warm_up(law)

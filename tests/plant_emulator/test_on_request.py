@@ -3,34 +3,26 @@
 from __future__ import annotations
 
 import itertools
-import threading
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from pymavlink.dialects.v20 import common
 
-from bridge.link import Link, open_link
+from bridge.link import open_link
 from bridge.memory import memory_pair
 from plant_emulator.process import MotorLink
 from plant_emulator.truth import load_truth
 from protocol import mavlink_map
-from protocol.errors import LinkClosedError
-from protocol.mavlink_codec import FrameWriter, layout
+from protocol.mavlink_codec import layout
 from protocol.tlog import read_tlog
 from tests.loop import fly_both, scenario_of
 from tests.plant_emulator.test_lockstep import Faulty
+from tests.station import Watcher, request
 
 SHORT = scenario_of("flapper", duration_s=0.4)
 STATE, ODOMETRY = layout("HIL_STATE_QUATERNION"), layout("ODOMETRY")
 _names = itertools.count()
-
-
-def request(command: int, *parameters: float, target: int = 191) -> bytes:
-    fields = {f"param{i + 1}": value for i, value in enumerate(parameters)}
-    payload = mavlink_map.COMMAND_LONG.pack_fields(command=command, target_system=1, target_component=target, **fields)
-    return FrameWriter(255, 190).seal(mavlink_map.COMMAND_LONG, payload)
 
 
 def frames_of(log: Path, message: Any) -> list[dict[str, Any]]:
@@ -101,48 +93,14 @@ def test_a_peer_on_the_loops_link_asks_and_is_answered_there(clock: str, tmp_pat
         )  # what was asked is in the record too
 
 
-class Watcher:
-    """A ground station that asks once for the truth, and hears what comes."""
-
-    def __init__(self, link: Link, *asks: bytes) -> None:
-        self._link, self._asks = link, list(asks)
-        self.heard: list[Any] = []
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._listen)
-
-    def __enter__(self) -> Watcher:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._ended.set()
-        self._thread.join()
-
-    def _listen(self) -> None:
-        parser = common.MAVLink(None)
-        while not self._ended.is_set():
-            if self._asks and self.heard:
-                self._link.send(self._asks.pop(0))
-            try:
-                self.heard += parser.parse_buffer(self._link.recv(0.01) or b"") or []
-            except LinkClosedError:
-                return
-
-    @property
-    def is_answered(self) -> bool:
-        """Whether a request was acknowledged."""
-        return any(one.get_type() == "COMMAND_ACK" for one in self.heard)
-
-    def times(self, name: str) -> list[int]:
-        return [one.time_usec for one in self.heard if one.get_type() == name]
-
-
 def test_a_ground_station_asks_on_its_own_link_and_the_loops_link_carries_none_of_it(tmp_path: Path) -> None:
     scenario = scenario_of("flapper", duration_s=1.0)
     near, far = memory_pair()
     uri = f"mem://station{next(_names)}"
     with near, far, open_link(uri) as link, Watcher(link, request(511, 331, 20_000.0)) as watcher:
-        late = Faulty(far, lambda _count, data: [data] if watcher.is_answered else [])  # the plant is held until then
+        late = Faulty(
+            far, lambda _count, data: [data] if watcher.has_heard("COMMAND_ACK") else []
+        )  # the plant is held until then
         ends = fly_both(scenario, near, late, tmp_path, station=uri)
     assert isinstance(ends.emulator, dict), ends
     assert ends.emulator["counters"]["requests"] == 1

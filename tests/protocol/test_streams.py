@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol import mavlink_map, truth_map
+from protocol import file_transfer, mavlink_map, parameter_map, truth_map
 from protocol.mavlink_codec import Layout, layout
 from protocol.streams import HEARTBEAT_TIMEOUT_NS, STREAMS, Due, End, Stream, markdown_table, stream
 
@@ -20,7 +20,7 @@ def dues(rate_hz: float, times_ns: list[int]) -> list[int]:
 
 class TestTable:
     def test_it_names_every_message_that_the_mapping_knows_and_no_other(self) -> None:
-        maps = (mavlink_map, truth_map)
+        maps = (mavlink_map, truth_map, parameter_map, file_transfer)
         mapped = {value.name for one in maps for value in vars(one).values() if isinstance(value, Layout)}
         assert {row.message for row in STREAMS} == mapped
         assert len(STREAMS) == len(mapped)
