@@ -12,6 +12,7 @@ from pathlib import Path
 from bridge.clock import Clock, MonotonicClock
 from bridge.link import Link
 from bridge.process import StopFlag, open_patiently
+from bridge.summary import make_folder
 from protocol import mavlink_map
 from protocol.errors import LinkError
 from protocol.mavlink_codec import Frame, FrameReader, FrameWriter, Layout
@@ -41,8 +42,10 @@ def open_station(
         return
     with contextlib.ExitStack() as stack:
         link = stack.enter_context(open_patiently(uri, wait_s, stop))
-        log = TlogWriter(record) if record else None
-        if log:
+        log = None
+        if record:
+            make_folder(record.parent)
+            log = TlogWriter(record)
             stack.callback(log.close)
         yield Station(link, who, MonotonicClock(), heartbeat, log)
 

@@ -72,10 +72,12 @@ class ParameterServer:
         refusal: Refusal | None = Refusal.OUT_OF_RANGE
         if wanted.value is not None:
             refusal = self._parameters.set(index, wanted.kind, wanted.value, armed=self._is_armed())
-        self._answers.append(self._parameters.saying(index))
         if refusal:
-            self._refuse(wanted, asker, refusal)
-        elif self._parameters.counters["parameters_set"] > before:
+            self._refuse(
+                wanted, asker, refusal
+            )  # first: a station that knows it need not take the old value for a miss
+        self._answers.append(self._parameters.saying(index))
+        if not refusal and self._parameters.counters["parameters_set"] > before:
             self._on_change(index)
 
     def _find(self, wanted: Wanted) -> int | None:

@@ -54,7 +54,7 @@ GROUPS = (
     Group("LAW_KP", "control", "Kp", "gain of PD and DOB", settable=True),
     Group("LAW_KD", "control", "Kd", "gain of PD and DOB", settable=True),
     Group("LAW_UHAT0", "control", "uhat0", "estimate at the start, m/s^2, rad/s^2", settable=True),
-    Group("LAW_ROTATE", "control", "rotate_force", "1: the force is rotated into the body", Kind.UINT8, False, True),
+    Group("LAW_ROTATE", "control", "rotate_force", "1: the force is rotated into the body", Kind.INT32, False, True),
     Group("LAW_ORDER", "control", "order", "order of the filter G_f", Kind.INT32, False),
     Group(
         "LAW_INDEX", "", "law", f"the law: {', '.join(f'{i} {name}' for i, name in enumerate(LAWS))}", Kind.INT32, False

@@ -27,7 +27,6 @@ _BY_NAME = -1
 class Kind(enum.IntEnum):
     """MAV_PARAM_TYPE of the parameters that there are here."""
 
-    UINT8 = common.MAV_PARAM_TYPE_UINT8
     INT32 = common.MAV_PARAM_TYPE_INT32
     REAL32 = common.MAV_PARAM_TYPE_REAL32
 
@@ -41,7 +40,7 @@ class Refusal(enum.IntEnum):
     ARMED = common.MAV_PARAM_ERROR_PERMISSION_DENIED
 
 
-_NUMBERS = {Kind.UINT8: struct.Struct("<B3x"), Kind.INT32: struct.Struct("<i"), Kind.REAL32: struct.Struct("<f")}
+_NUMBERS = {Kind.INT32: struct.Struct("<i"), Kind.REAL32: struct.Struct("<f")}
 
 
 class Wanted(NamedTuple):

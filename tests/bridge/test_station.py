@@ -80,6 +80,14 @@ def test_no_link_is_no_station_and_a_wrong_one_is_said() -> None:
         pass
 
 
+def test_the_folder_of_the_record_is_made(tmp_path: Path) -> None:
+    record = tmp_path / "new" / "station.tlog"
+    with open_station("udpin://127.0.0.1:0", WHO, heartbeat, record, 1.0, StopFlag()) as station:
+        assert station is not None
+        station.poll()
+    assert [frame.message_id for _, frame in read_tlog(record)] == [0]
+
+
 def test_the_counters_are_the_links_and_the_readers() -> None:
     near, far = memory_pair()
     station = Station(near, WHO, VirtualClock(), heartbeat)

@@ -135,11 +135,11 @@ def test_integers_travel_bytewise() -> None:
     assert value.param_type == common.MAV_PARAM_TYPE_INT32
     assert struct.unpack("<i", struct.pack("<f", value.param_value)) == (2,)
     (zero,) = struct.unpack("<f", bytes((0, 0, 0, 0)))
-    (answer,) = peer.set(b"LAW_ROTATE", zero, Kind.UINT8)
+    (answer,) = peer.set(b"LAW_ROTATE", zero, Kind.INT32)
     assert peer.parameters.scenario.control.rotate_force is False
     assert (answer.param_id, answer.param_value) == ("LAW_ROTATE", 0.0)
     (one,) = struct.unpack("<f", bytes((1, 0, 0, 0)))
-    peer.set(b"LAW_ROTATE", one, Kind.UINT8)
+    peer.set(b"LAW_ROTATE", one, Kind.INT32)
     assert peer.parameters.scenario == FLAPPER
 
 
@@ -194,14 +194,14 @@ def test_what_is_there_already_to_float32_changes_nothing() -> None:
         (b"LAW_K_X", math.inf, Kind.REAL32, False, Refusal.OUT_OF_RANGE),
         (b"LAW_K_X", 22.5, common.MAV_PARAM_TYPE_REAL64, False, Refusal.OUT_OF_RANGE),
         (b"LAW_K_X", 22.5, Kind.INT32, False, Refusal.OUT_OF_RANGE),
-        (b"LAW_ROTATE", struct.unpack("<f", bytes((2, 0, 0, 0)))[0], Kind.UINT8, False, Refusal.OUT_OF_RANGE),
+        (b"LAW_ROTATE", struct.unpack("<f", bytes((2, 0, 0, 0)))[0], Kind.INT32, False, Refusal.OUT_OF_RANGE),
     ],
 )
 def test_sets_that_would_break_something_are_refused_and_counted(
     name: bytes, value: float, kind: int, armed: bool, refusal: Refusal
 ) -> None:
     peer = Peer(armed=armed)
-    held, error = peer.set(name, value, kind)
+    error, held = peer.set(name, value, kind)
     assert held.param_id == error.param_id == name.decode()
     (index,) = [i for i, one in enumerate(peer.parameters.table) if one.name == name.decode()]
     before = np.float32(value_of(FLAPPER, peer.parameters.table[index]))
