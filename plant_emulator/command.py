@@ -48,6 +48,10 @@ Example:
     ),
     clock_option,
     speed_option,
+    click.option(
+        "--profile", type=click.Choice(["exact", "tolerant"]), default="exact", show_default=True,
+        help="Lockstep that waits for each answer of our controller, or bears with an autopilot that answers in its own time.",
+    ),
     realtime_option,
     spin_option,
     rate_option,
@@ -72,6 +76,7 @@ def emulator(
     link: str,
     clock: str,
     speed: float | None,
+    profile: str,
     realtime: bool,
     spin_us: int | None,
     rate: float | None,
@@ -110,6 +115,7 @@ def emulator(
         link=link, clock=clock, speed=speed, out=out, wait_s=wait_s, spin_s=None if spin_us is None else spin_us * 1e-6,
         realtime=realtime, core=own_core(0) if core is None else core, delay_ns=delay_ns, legs=legs,
         on_log_error=on_log_error, motors=motors, station=station, truth_hz=truth_hz,
+        profile=profile,
     )  # fmt: skip
     summary = run_emulator(chosen, run_options, report, stop)
     show_json(json_path, {"scenario": chosen.name, "rate_hz": chosen.rate_hz, "seed": chosen.seed, **summary})

@@ -123,12 +123,19 @@ class Emulator:
             tau = self.motors.drive(t_ns, tau, acts_ns)  # the force behind the gears: the plant takes it as it is
         self.plant.command(acts_ns, tau)
 
-    def check_staleness(self, t_ns: int) -> None:
-        """Turn to the safe output where no command has come for too long."""
+    def hold(self, end_ns: int) -> None:
+        """Record the tick and let time pass with the plant where it is."""
+        t_ns = self.plant.t_ns
+        self.plant.record_and_advance(t_ns, self._quick.newest, self._row)
+        self._record(t_ns)
+        self.plant.t_ns = end_ns
+
+    def check_staleness(self, t_ns: int, delay_ns: int = 0) -> None:
+        """Turn to the safe output, as late as any command acts, where none has come for too long."""
         stale = self.safety.stale_output(t_ns)
         if stale is not None:
             expired_ns, output = stale
-            acts_ns = max(expired_ns, self.plant.t_ns)
+            acts_ns = max(expired_ns + delay_ns, self.plant.t_ns)
             self._drive(acts_ns, acts_ns, output)
 
     def advance(self, end_ns: int) -> None:

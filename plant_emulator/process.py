@@ -26,6 +26,7 @@ from bridge.summary import make_folder, percentiles_us, refuse_existing_run, wri
 from plant_emulator.emulator import Emulator
 from plant_emulator.on_request import OnRequest
 from plant_emulator.pacing import Lockstep, Pacing, Parts, RealTime
+from plant_emulator.tolerant import Tolerant, meet_autopilot
 from plant_emulator.truth import TruthWriter
 from protocol import mavlink_map
 from protocol.errors import FwavHilError, PeerMissingError, RunFolderError, UsageError
@@ -66,7 +67,7 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     before each deadline (None: as measured with `realtime`, else 0).
     on_log_error: what a disk that refuses means for the run: "stop", or "continue" with what can be recorded.
     motors: where the drives are, if not in the plant itself. station: URI of a ground station's link. truth_hz: say the true
-    state on the link at this rate, as if its peer had asked for it.
+    state on the link at this rate, as if its peer had asked for it. profile: of lockstep, "exact" or "tolerant".
     """
 
     link: str
@@ -83,6 +84,7 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     motors: MotorLink | None = None
     station: str | None = None
     truth_hz: float | None = None
+    profile: str = "exact"
 
 
 def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
@@ -90,6 +92,10 @@ def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, s
     if options.clock != "realtime" and (options.delay_ns or options.legs):
         raise UsageError(
             "--delay and --legs are of real time: add --clock realtime (in lockstep the delay is the scenario's, [delay])"
+        )
+    if options.profile == "tolerant" and (options.clock != "lockstep" or options.motors):
+        raise UsageError(
+            "--profile tolerant is of lockstep, with the gears in the plant: leave out --clock realtime and --motor can"
         )
     if options.legs and not options.out:
         raise UsageError("--legs needs a folder for the time stamps: add --out DIR")
@@ -134,7 +140,10 @@ def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report
             parts = Parts(emulator, endpoint, log, MonotonicClock(), stop, scenario.period_ns)
             pacing = _pacing(scenario, options, parts, settings)
             report({"event": "waiting", "link": link.uri})
-            meet_controller(scenario, options.wait_s, endpoint, stop, emulator.on_request)
+            if isinstance(pacing, Tolerant):
+                meet_autopilot(options.wait_s, endpoint, stop, emulator.on_request)
+            else:
+                meet_controller(scenario, options.wait_s, endpoint, stop, emulator.on_request)
             report({"event": "started", "peer": link.peer})
             if options.legs and isinstance(pacing, RealTime):
                 pacing.legs = LegTable(TICK_COLUMNS), LegTable(ANSWER_COLUMNS)
@@ -222,6 +231,8 @@ def _pacing(scenario: Scenario, options: EmulatorOptions, parts: Parts, settings
         through = not wakes and parts.endpoint.link.stamp_receives()
         return RealTime(parts, ticks=scenario.ticks, spin_ns=spin_ns, sleeps_through=through)
     keeper = RateKeeper(parts.clock, round(scenario.period_ns / options.speed)) if options.speed else None
+    if options.profile == "tolerant":
+        return Tolerant(parts, ticks=scenario.ticks, delay_ns=scenario.delay_ns, keeper=keeper, wait_s=options.wait_s)
     return Lockstep(parts, ticks=scenario.ticks, delay_ns=scenario.delay_ns, keeper=keeper)
 
 
