@@ -21,6 +21,7 @@ from bridge.process import Report, StopFlag, open_patiently, take_folder
 from bridge.rate import RateKeeper, choose_spin_ns
 from bridge.realtime import has_own_core, maybe_real_time, report_settings
 from bridge.requests import NEVER
+from bridge.signed_link import signed
 from bridge.station import Station, open_station
 from bridge.summary import write_json
 from bridge.timesync import TimeSync
@@ -53,7 +54,8 @@ class ControllerOptions(msgspec.Struct, frozen=True, kw_only=True):
     link: a URI, or `-` to read it from standard input once everything is ready. legs: real time: note when each sample
     and command was where. trigger: in real time, `sample` or `clock`. realtime, core: ask for what `bridge.realtime` lists.
     spin_s: in lockstep see `Link.spin_s` (None: 0); in real time how long to poll before a sample or deadline is due (None:
-    as measured with `realtime`, else 0). station: URI of a ground station's link.
+    as measured with `realtime`, else 0). station: URI of a ground station's link. key: of
+    signatures on the loop's link.
     """
 
     link: str
@@ -67,6 +69,7 @@ class ControllerOptions(msgspec.Struct, frozen=True, kw_only=True):
     realtime: bool = False
     core: int | None = None
     station: str | None = None
+    key: bytes | None = None
 
 
 class Controller:
@@ -370,7 +373,7 @@ def run_controller(scenario: Scenario, options: ControllerOptions, report: Repor
             link.spin_s = options.spin_s or 0.0
         if options.legs:
             link.stamp_receives()
-        return serve(scenario, law, link, options, report, stop)
+        return serve(scenario, law, signed(link, options.key), options, report, stop)
 
 
 def _told_link() -> str:

@@ -66,6 +66,7 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     legs: bool = False
     on_log_error: str = "stop"
     station: str | None = None
+    signing_key: Path | None = None
     emulator_station: str | None = None
     truth_hz: float | None = None
 
@@ -153,6 +154,7 @@ def _start(folder: Path, options: RunOptions, placement: Placement) -> tuple[Chi
     """
     common = [str(folder / FILES["scenario"]), "--clock", options.clock, "--out", str(folder)]
     common += ["--wait", str(options.wait_s), *(("--legs",) if options.legs else ())]
+    common += ["--signing-key", str(options.signing_key)] if options.signing_key else []
     flight = ["--link", options.link, "--on-log-error", options.on_log_error]
     if options.speed:
         flight += ["--speed", str(options.speed)]

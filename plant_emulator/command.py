@@ -21,6 +21,8 @@ from bridge.command_line import (
     realtime_option,
     scenario_argument,
     seed_option,
+    signing_key_of,
+    signing_option,
     spin_option,
     station_option,
     truth_option,
@@ -61,6 +63,7 @@ Example:
     legs_option,
     wait_option,
     station_option,
+    signing_option,
     truth_option,
     run_motor_options,
     click.option(
@@ -86,6 +89,7 @@ def emulator(
     legs: bool,
     wait_s: float,
     station: str | None,
+    signing_key: Path | None,
     truth_hz: float | None,
     motor: str,
     can: str,
@@ -114,7 +118,7 @@ def emulator(
     run_options = EmulatorOptions(
         link=link, clock=clock, speed=speed, out=out, wait_s=wait_s, spin_s=None if spin_us is None else spin_us * 1e-6,
         realtime=realtime, core=own_core(0) if core is None else core, delay_ns=delay_ns, legs=legs,
-        on_log_error=on_log_error, motors=motors, station=station, truth_hz=truth_hz,
+        on_log_error=on_log_error, motors=motors, station=station, key=signing_key_of(signing_key), truth_hz=truth_hz,
         profile=profile,
     )  # fmt: skip
     summary = run_emulator(chosen, run_options, report, stop)

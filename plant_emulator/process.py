@@ -21,6 +21,7 @@ from bridge.rate import RateKeeper, choose_spin_ns
 from bridge.realtime import Settings, has_own_core, maybe_real_time, report_settings
 from bridge.ring_recorder import RingRecorder
 from bridge.sidecar import LinkOfLog
+from bridge.signed_link import signed
 from bridge.station import open_station
 from bridge.summary import make_folder, percentiles_us, refuse_existing_run, write_json, write_text
 from plant_emulator.emulator import Emulator
@@ -67,7 +68,8 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     before each deadline (None: as measured with `realtime`, else 0).
     on_log_error: what a disk that refuses means for the run: "stop", or "continue" with what can be recorded.
     motors: where the drives are, if not in the plant itself. station: URI of a ground station's link. truth_hz: say the true
-    state on the link at this rate, as if its peer had asked for it. profile: of lockstep, "exact" or "tolerant".
+    state on the link at this rate, as if its peer had asked for it. key: of signatures on
+    the loop's link. profile: of lockstep, "exact" or "tolerant".
     """
 
     link: str
@@ -83,6 +85,7 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     core: int | None = None
     motors: MotorLink | None = None
     station: str | None = None
+    key: bytes | None = None
     truth_hz: float | None = None
     profile: str = "exact"
 
@@ -106,7 +109,7 @@ def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, s
         if options.legs or options.delay_ns:
             link.stamp_receives()  # a delay counts from the arrival, not from when we got round to it
         delayed = DelayedLink(link, options.delay_ns, MonotonicClock()) if options.delay_ns else link
-        return fly(scenario, delayed, options, report, stop)
+        return fly(scenario, signed(delayed, options.key), options, report, stop)
 
 
 def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
