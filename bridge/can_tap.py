@@ -40,13 +40,15 @@ class CanTap:
         self._requests = Requests(who, {}, {CAN_FORWARD: self._forward})
         self._clock = clock
         self._until_ns: int | None = None
+        self._departures = 0
         self._theirs: deque[CanFrame] = deque(maxlen=_MOST_AT_ONCE)
         self.counters = dict.fromkeys(("tap_sent", "tap_taken", "tap_requests", "tap_refused"), 0)
 
     @property
     def forwarding(self) -> bool:
         """Whether a station has asked for the bus within the last 5 s."""
-        return self._until_ns is not None and self._clock.now_ns() < self._until_ns
+        is_same = self._station.departures == self._departures  # who comes next must ask for itself
+        return self._until_ns is not None and is_same and self._clock.now_ns() < self._until_ns
 
     def watch(self, _t_ns: int, frame: CanFrame) -> None:
         """Show a frame of the bus to the station, if it wants that."""
@@ -62,7 +64,6 @@ class CanTap:
         if self._until_ns is not None and not self.forwarding:
             self._until_ns = None
             self._station.release()
-        departures = self._station.departures
         refused = self._requests.counters["requests_refused"]
         for message in self._station.poll():
             if message.message_id == mavlink_map.CAN_FRAME.message_id:
@@ -78,8 +79,6 @@ class CanTap:
         self.counters["tap_refused"] += self._requests.counters["requests_refused"] - refused
         for saying in self._requests.due(0, lambda _number, _t_ns: ()):
             self._station.say(*saying)
-        if self._station.departures > departures:
-            self._until_ns = None  # who comes next must ask for itself
         return frames
 
     def _forward(self, request: Request) -> Result:
@@ -87,5 +86,6 @@ class CanTap:
         if bus not in (0, 1):
             return Result.DENIED
         self._until_ns = self._clock.now_ns() + RENEW_NS if bus else None
+        self._departures = self._station.departures
         self.counters["tap_requests"] += 1
         return Result.ACCEPTED
