@@ -13,12 +13,12 @@ from typing import Final
 from bridge.clock import Clock
 from bridge.endpoint import VEHICLE
 from bridge.link import Link
+from bridge.requests import Requests
+from bridge.station import Station
 from protocol import mavlink_map
 from protocol.can_frame import CanFrame
-from protocol.errors import LinkError
-from protocol.mavlink_codec import FrameReader, FrameWriter, Layout
+from protocol.requests import CAN_FORWARD, Request, Result, wanted_bus
 from protocol.scenario import NANOSECONDS
-from protocol.streams import Due
 
 RENEW_NS: Final = 5 * NANOSECONDS
 _MOST_AT_ONCE = 64
@@ -35,75 +35,57 @@ class CanTap:
     """
 
     def __init__(self, link: Link, component: int, clock: Clock) -> None:
-        self._link = link
-        self._reader = FrameReader(is_datagram=link.is_datagram, follow_sequence=False)
-        self._writer = FrameWriter(VEHICLE[0], component)
+        who = (VEHICLE[0], component)
+        self._station = Station(link, who, clock, mavlink_map.encode_emulator_heartbeat)
+        self._requests = Requests(who, {}, {CAN_FORWARD: self._forward})
         self._clock = clock
         self._until_ns: int | None = None
-        self._heartbeat = Due(1.0)
+        self._departures = 0
         self._theirs: deque[CanFrame] = deque(maxlen=_MOST_AT_ONCE)
         self.counters = dict.fromkeys(("tap_sent", "tap_taken", "tap_requests", "tap_refused"), 0)
 
     @property
     def forwarding(self) -> bool:
         """Whether a station has asked for the bus within the last 5 s."""
-        return self._until_ns is not None and self._clock.now_ns() < self._until_ns
+        is_same = self._station.departures == self._departures  # who comes next must ask for itself
+        return self._until_ns is not None and is_same and self._clock.now_ns() < self._until_ns
 
     def watch(self, _t_ns: int, frame: CanFrame) -> None:
         """Show a frame of the bus to the station, if it wants that."""
         if frame in self._theirs:
             self._theirs.remove(frame)  # what the station said itself
         elif self.forwarding:
-            self._send(mavlink_map.CAN_FRAME, mavlink_map.encode_can_frame(frame))
+            self._station.say(mavlink_map.CAN_FRAME, mavlink_map.encode_can_frame(frame))
             self.counters["tap_sent"] += 1
 
     def poll(self) -> list[CanFrame]:
         """Take what the station says, without waiting; returns its frames for the bus."""
         frames: list[CanFrame] = []
         if self._until_ns is not None and not self.forwarding:
-            self._forget_station()
-        for _ in range(_MOST_AT_ONCE):
-            try:
-                data = self._link.recv(0.0)
-            except LinkError:
-                self._forget_station()
-                break
-            if not data:
-                break
-            for message in self._reader.read(data):
-                if message.message_id == mavlink_map.COMMAND_LONG.message_id:
-                    self._take_command(message.payload)
-                elif message.message_id == mavlink_map.CAN_FRAME.message_id:
-                    frame = mavlink_map.decode_can_frame(message.payload)
-                    if frame is None or not self.forwarding:
-                        self.counters["tap_refused"] += 1
-                        continue
-                    self.counters["tap_taken"] += 1
-                    self._theirs.append(frame)
-                    frames.append(frame)
-        if self.forwarding and self._heartbeat.at(self._clock.now_ns()):
-            self._send(mavlink_map.HEARTBEAT, mavlink_map.encode_emulator_heartbeat())
+            self._until_ns = None
+            self._station.release()
+        refused = self._requests.counters["requests_refused"]
+        for message in self._station.poll():
+            if message.message_id == mavlink_map.CAN_FRAME.message_id:
+                frame = mavlink_map.decode_can_frame(message.payload)
+                if frame is None or not self.forwarding:
+                    self.counters["tap_refused"] += 1
+                    continue
+                self.counters["tap_taken"] += 1
+                self._theirs.append(frame)
+                frames.append(frame)
+            else:
+                self._requests.take(message)
+        self.counters["tap_refused"] += self._requests.counters["requests_refused"] - refused
+        for saying in self._requests.due(0, lambda _number, _t_ns: ()):
+            self._station.say(*saying)
         return frames
 
-    def _take_command(self, payload: bytes) -> None:
-        request = mavlink_map.decode_can_forward(payload)
-        if request is None:
-            self.counters["tap_refused"] += 1
-            return
-        accepted = request in (0, 1)
-        if accepted:
-            self._until_ns = self._clock.now_ns() + RENEW_NS if request else None
-            self.counters["tap_requests"] += 1
-        else:
-            self.counters["tap_refused"] += 1
-        self._send(mavlink_map.COMMAND_ACK, mavlink_map.encode_can_forward_acknowledgement(accepted=accepted))
-
-    def _send(self, message: Layout, payload: bytes) -> None:
-        try:
-            self._link.send(self._writer.seal(message, payload))
-        except LinkError:
-            self._forget_station()
-
-    def _forget_station(self) -> None:
-        self._until_ns = None
-        self._link.release_peer()
+    def _forward(self, request: Request) -> Result:
+        bus = wanted_bus(request)
+        if bus not in (0, 1):
+            return Result.DENIED
+        self._until_ns = self._clock.now_ns() + RENEW_NS if bus else None
+        self._departures = self._station.departures
+        self.counters["tap_requests"] += 1
+        return Result.ACCEPTED

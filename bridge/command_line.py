@@ -105,11 +105,33 @@ spin_option = click.option(
     "each answer.",
 )  # fmt: skip
 
+station_option = click.option(
+    "--station", metavar="URI",
+    help="A ground station's link, besides the loop's: udpout://127.0.0.1:14550, udpin://, tcpin:// (docs/station.md).",
+)  # fmt: skip
+signing_option = click.option(
+    "--signing-key", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
+    help="Sign all that is said on the loop's link and believe only what is signed with this key: 64 hex digits or 32 bytes.",
+)  # fmt: skip
+truth_option = click.option(
+    "--truth", "truth_hz", type=click.FloatRange(min=0.1), metavar="HZ",
+    help="Say the true state on the link, and so in the log, at this rate: HIL_STATE_QUATERNION and ODOMETRY.",
+)  # fmt: skip
+
 process_options = options(
     click.option("--status", type=click.Choice(["text", "jsonl"]), default="text", hidden=True),
     click.option("--core", type=int, hidden=True),
     click.option("--with-parent", is_flag=True, hidden=True),
 )
+
+
+def signing_key_of(path: Path | None) -> bytes | None:
+    """The key in a file, or None where none is named. Raises UsageError."""
+    if path is None:
+        return None
+    from protocol.retime import read_key
+
+    return read_key(path)
 
 
 def chosen_scenario(name: str, **overrides: Any) -> Scenario:

@@ -38,7 +38,7 @@ class Endpoint:
 
     def counters(self) -> dict[str, int]:
         """What the link and the reader have counted, by name."""
-        return {**self.link.stats.as_dict(), **self.reader.counters}
+        return {**self.link.counters(), **self.reader.counters}
 
 
 def refuse_other_scenario(peer: str, theirs: bytes, ours: bytes) -> None:

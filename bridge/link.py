@@ -112,6 +112,10 @@ class Link(abc.ABC):
         """Have `received_ns` told from now on; False where the transport or the system cannot."""
         return False
 
+    def counters(self) -> dict[str, int]:
+        """What the link has counted, by name."""
+        return self.stats.as_dict()
+
     def release_peer(self) -> None:  # noqa: B027  (most links have nothing to release)
         """Forget the peer, so that another may take its place; does nothing where the peer is fixed."""
 

@@ -19,7 +19,10 @@ from bridge.command_line import (
     rate_option,
     realtime_option,
     scenario_argument,
+    signing_key_of,
+    signing_option,
     spin_option,
+    station_option,
     trigger_option,
     wait_option,
 )
@@ -53,6 +56,8 @@ Example:
     ),
     legs_option,
     wait_option,
+    station_option,
+    signing_option,
     click.option(
         "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", help="Folder for the counters.",
     ),
@@ -71,6 +76,8 @@ def controller(
     arm: bool,
     legs: bool,
     wait_s: float,
+    station: str | None,
+    signing_key: Path | None,
     out: Path | None,
     json_path: Path | None,
     status: str,
@@ -87,7 +94,8 @@ def controller(
 
     run_options = ControllerOptions(
         link=link, clock=clock, arm=arm, out=out, wait_s=wait_s, spin_s=None if spin_us is None else spin_us * 1e-6,
-        trigger=trigger, realtime=realtime, core=own_core(1) if core is None else core, legs=legs,
+        trigger=trigger, realtime=realtime, core=own_core(1) if core is None else core, legs=legs, station=station,
+        key=signing_key_of(signing_key),
     )  # fmt: skip
     summary = run_controller(chosen, run_options, report, stop)
     show_json(json_path, {"scenario": chosen.name, "rate_hz": chosen.rate_hz, **summary})

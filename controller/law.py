@@ -282,6 +282,17 @@ class Law:
         packed_control_step(self.packed, state.packed, t_ns, q, q_dot)
         return state.tau.copy()
 
+    def adopt(self, other: Law) -> None:
+        """Take over another's gains, in place: whoever steps this law steps them from now on; then `restart`.
+
+        Raises UsageError, with nothing changed, where the other law is of another form, or its gains are too far out for
+        finite matrices.
+        """
+        if other.packed.dtype != self.packed.dtype or not all(np.isfinite(part).all() for part in other.realisation):
+            raise UsageError(f"the law '{other.name}' with these gains cannot take the place of '{self.name}'")
+        self.realisation, self.output = other.realisation, other.output
+        self.packed[...] = other.packed
+
     @staticmethod
     def restart(state: LawState) -> None:
         """Let the next sample start the law as its first did; what was counted stays."""

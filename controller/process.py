@@ -20,11 +20,16 @@ from bridge.memory import memory_pair
 from bridge.process import Report, StopFlag, open_patiently, take_folder
 from bridge.rate import RateKeeper, choose_spin_ns
 from bridge.realtime import has_own_core, maybe_real_time, report_settings
+from bridge.requests import NEVER
+from bridge.signed_link import signed
+from bridge.station import Station, open_station
 from bridge.summary import write_json
 from bridge.timesync import TimeSync
 from controller.actuation import HilActuation
+from controller.ground_station import GroundStation
 from controller.law import Law
 from controller.laws import make_law, refuse_on_a_link
+from controller.parameters import Parameters
 from controller.quick import QuickAnswers
 from controller.telemetry import HilTelemetry
 from controller.vehicle import Vehicle
@@ -36,6 +41,7 @@ from protocol.streams import HEARTBEAT_TIMEOUT_NS, Due
 from protocol.tick_frames import CommandWriter
 
 RESULT = "controller.json"
+STATION_FILE = "station_controller.tlog"
 HELLO_PERIOD_S = 0.1
 LOOK_PERIOD_S = 0.1
 PATIENCE_PERIODS = 1.5
@@ -48,7 +54,8 @@ class ControllerOptions(msgspec.Struct, frozen=True, kw_only=True):
     link: a URI, or `-` to read it from standard input once everything is ready. legs: real time: note when each sample
     and command was where. trigger: in real time, `sample` or `clock`. realtime, core: ask for what `bridge.realtime` lists.
     spin_s: in lockstep see `Link.spin_s` (None: 0); in real time how long to poll before a sample or deadline is due (None:
-    as measured with `realtime`, else 0).
+    as measured with `realtime`, else 0). station: URI of a ground station's link. key: of
+    signatures on the loop's link.
     """
 
     link: str
@@ -61,6 +68,8 @@ class ControllerOptions(msgspec.Struct, frozen=True, kw_only=True):
     trigger: str = "sample"
     realtime: bool = False
     core: int | None = None
+    station: str | None = None
+    key: bytes | None = None
 
 
 class Controller:
@@ -84,6 +93,7 @@ class Controller:
         clock: Clock,
         stop: StopFlag,
         spin_ns: int = 0,
+        station: Station | None = None,
     ) -> None:
         component = scenario.wire.emulator_component
         self.law = law
@@ -92,7 +102,10 @@ class Controller:
         self.clock = clock
         self.options = options
         self.endpoint = Endpoint(link, *VEHICLE)
-        self.vehicle = Vehicle(self.endpoint, scenario.digest(), component, arm=options.arm)
+        self.parameters = Parameters(scenario, lambda changed: law.adopt(make_law(law.name, changed)))
+        self.vehicle = Vehicle(self.endpoint, scenario.digest(), component, arm=options.arm, parameters=self.parameters)
+        self.station = GroundStation(station, self.vehicle, self.parameters) if station else None
+        self._look_ns = 0 if station else NEVER
         self.telemetry = HilTelemetry(component)
         lockstep = options.clock == "lockstep"
         self.actuation = HilActuation(self.endpoint, self.vehicle, law.output.scale, clock, lockstep=lockstep)
@@ -135,7 +148,13 @@ class Controller:
             computed_ns = self.clock.now_ns()
             self.actuation.publish(ActuatorCommand(sample.t_ns, tau, armed), self.state.desired)
             self._note(sample.t_ns, computed_ns)
+            self._hear_station(sample.t_ns)
             self._get_ready()
+
+    def _hear_station(self, t_ns: int) -> None:
+        if self.station:
+            self.station.poll_if_due(t_ns)
+            self._look_ns = self.station.next_ns
 
     def _meet(self) -> None:
         """Say hello until the first sample comes."""
@@ -148,6 +167,8 @@ class Controller:
                 self.endpoint.send(self.vehicle.hello())
                 said = self.vehicle.agreed
             self._look(HELLO_PERIOD_S)
+            if self.station:
+                self.station.poll(0)
             if self._samples or self.vehicle.ended:
                 return
         uri = self.endpoint.link.uri
@@ -209,6 +230,8 @@ class Controller:
 
         One by one: a stall of the whole machine then counts as one wait, not as silence.
         """
+        if self.station:
+            self.station.poll(self.actuation.answered_ns)
         self._silence_ns += min(self.clock.now_ns() - begun_ns, round(2e9 * self._patience_s))
         if self._silence_ns > HEARTBEAT_TIMEOUT_NS:
             raise PeerLostError(
@@ -291,7 +314,8 @@ class Controller:
     def _get_ready(self) -> None:
         """Say which samples may be answered at once: those after the last one, while armed and nothing else is due."""
         armed = self._was_armed and self.vehicle.armed and not self._samples
-        self._quick.get_ready(self.actuation.answered_ns, self.actuation.quiet_until_ns if armed else 0)
+        quiet_until_ns = min(self.actuation.quiet_until_ns, self._look_ns) if armed else 0
+        self._quick.get_ready(self.actuation.answered_ns, quiet_until_ns)
 
     def processor_share(self) -> float:
         """The share of a core that the run has taken since its first sample."""
@@ -306,6 +330,9 @@ class Controller:
             **self.actuation.counters,
             **self.law.counts(self.state),
             **self.counters,
+            **self.vehicle.requests.counters,
+            **self.parameters.counters,
+            **(self.station.counters() if self.station else {}),
             **(self.keeper.counters if self.keeper else {}),
         }
 
@@ -346,7 +373,7 @@ def run_controller(scenario: Scenario, options: ControllerOptions, report: Repor
             link.spin_s = options.spin_s or 0.0
         if options.legs:
             link.stamp_receives()
-        return serve(scenario, law, link, options, report, stop)
+        return serve(scenario, law, signed(link, options.key), options, report, stop)
 
 
 def _told_link() -> str:
@@ -366,13 +393,19 @@ def serve(
     """
     clock = MonotonicClock()
     error: FwavHilError | None = None
-    with maybe_real_time(options.core, wanted=options.realtime) as settings:
+    with (
+        open_station(
+            options.station, VEHICLE, lambda: mavlink_map.encode_controller_heartbeat(armed=controller.vehicle.armed),
+            options.out / STATION_FILE if options.out else None, options.wait_s, stop,
+        ) as station,
+        maybe_real_time(options.core, wanted=options.realtime) as settings,
+    ):  # fmt: skip
         report_settings(report, settings)
         lockstep = options.clock == "lockstep"
         spin_ns = choose_spin_ns(
             clock, law.period_ns, 0.0 if lockstep else options.spin_s, measure=has_own_core(settings)
         )
-        controller = Controller(scenario, law, link, options, clock, stop, spin_ns)
+        controller = Controller(scenario, law, link, options, clock, stop, spin_ns, station)
         try:
             controller.run()
         except FwavHilError as stopped:

@@ -26,8 +26,12 @@ from bridge.command_line import (
     realtime_option,
     scenario_argument,
     seed_option,
+    signing_key_of,
+    signing_option,
     spin_option,
+    station_option,
     trigger_option,
+    truth_option,
     wait_option,
 )
 from bridge.option_types import check_speed, speed_option
@@ -127,6 +131,13 @@ plots_option = click.option("--plots/--no-plots", default=True, show_default=Tru
     delay_option,
     legs_option,
     run_motor_options,
+    truth_option,
+    station_option,
+    signing_option,
+    click.option(
+        "--emulator-station", metavar="URI",
+        help="A ground station's link to the emulator: the true state and the drives' speed, on request (docs/station.md).",
+    ),
     wait_option,
     out_option,
     log_error_option,
@@ -154,6 +165,10 @@ def run_command(
     feedback: str,
     can_log: Path | None,
     tap: str | None,
+    truth_hz: float | None,
+    station: str | None,
+    signing_key: Path | None,
+    emulator_station: str | None,
     wait_s: float,
     out: Path | None,
     on_log_error: str,
@@ -179,6 +194,7 @@ def run_command(
     check_real_time(clock, realtime=realtime, trigger=trigger)
     check_speed(clock, speed, chosen.rate_hz)
     check_link(link)
+    signing_key_of(signing_key)  # a wrong one is said before anything is started
     if clock == "realtime":
         refuse_rate_that_cannot_fit(link, chosen.rate_hz)
     if clock != "realtime" and (delay_ns or legs):
@@ -195,7 +211,8 @@ def run_command(
     try:
         run_options = RunOptions(
             clock=clock, link=link, speed=speed, wait_s=wait_s, delay_ns=delay_ns, legs=legs, on_log_error=on_log_error,
-            motors=motors, realtime=realtime, trigger=trigger, spin_us=spin_us,
+            motors=motors, realtime=realtime, trigger=trigger, spin_us=spin_us, truth_hz=truth_hz,
+            station=station, signing_key=signing_key, emulator_station=emulator_station,
         )  # fmt: skip
         run(chosen, folder, run_options)
     except FwavHilError:

@@ -23,6 +23,10 @@ _DROPPED = (
     "send_failed",
     "sequence_gaps",
     "tick_without_pose",
+    "unsigned",
+    "bad_signature",
+    "old_signature",
+    "unsealed",
 )
 _REFUSED = (
     "refused_commands",

@@ -49,7 +49,8 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     """How the run is made. link: the emulator's URI; the controller gets its counterpart.
 
     show_progress: False where the caller shows its own, and wants no line on the budget. delay_ns, legs: see
-    `EmulatorOptions`. realtime, trigger, spin_us: see the commands' options.
+    `EmulatorOptions`, as for truth_hz; station: the controller's, emulator_station: the emulator's `station`. realtime,
+    trigger, spin_us: see the commands' options.
     """
 
     clock: str = "lockstep"
@@ -64,6 +65,10 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
     delay_ns: int = 0
     legs: bool = False
     on_log_error: str = "stop"
+    station: str | None = None
+    signing_key: Path | None = None
+    emulator_station: str | None = None
+    truth_hz: float | None = None
 
 
 class RunFailedError(FwavHilError):
@@ -149,6 +154,7 @@ def _start(folder: Path, options: RunOptions, placement: Placement) -> tuple[Chi
     """
     common = [str(folder / FILES["scenario"]), "--clock", options.clock, "--out", str(folder)]
     common += ["--wait", str(options.wait_s), *(("--legs",) if options.legs else ())]
+    common += ["--signing-key", str(options.signing_key)] if options.signing_key else []
     flight = ["--link", options.link, "--on-log-error", options.on_log_error]
     if options.speed:
         flight += ["--speed", str(options.speed)]
@@ -156,7 +162,12 @@ def _start(folder: Path, options: RunOptions, placement: Placement) -> tuple[Chi
         flight += ["--delay", f"{options.delay_ns}ns"]
     if options.motors:
         flight += options.motors.emulator_arguments
+    if options.truth_hz:
+        flight += ["--truth", str(options.truth_hz)]
+    if options.emulator_station:
+        flight += ["--station", options.emulator_station]
     answers = ["--link", "-", "--arm", "--trigger", options.trigger]
+    answers += ["--station", options.station] if options.station else []
     return (
         Child("plant_emulator", [*common, *placement.emulator, *flight]),
         Child("controller", [*common, *placement.controller, *answers]),

@@ -113,6 +113,8 @@ class CanMotors:
         self._recovering = False
         self._begun = False
         self._tau = np.array(scenario.initial.command)
+        self.velocities: FloatArray = np.zeros(DRIVES)
+        """(6,) how fast the drives said that they turn, rad/s."""
         self._coming: deque[tuple[int, FloatArray]] = deque()
         names = ("resent", "outages", "outage_ticks", "recoveries", "safe_ticks", "enables", "late_answers", "faults")
         self._counters = {
@@ -286,6 +288,8 @@ class CanMotors:
                 self._enabled = self._enabled | bit if status.enabled else self._enabled & ~bit
             elif status.faulty is not None:
                 self._enabled = self._enabled & ~bit if status.faulty else self._enabled | bit
+        if status.velocity is not None:
+            self.velocities[status.axis] = status.velocity
         if status.position is not None:
             travel = self._scenario.motor.travel_rad
             self._bus_u[status.axis] = status.position / travel * self._scale[status.axis]

@@ -21,7 +21,11 @@ from bridge.command_line import (
     realtime_option,
     scenario_argument,
     seed_option,
+    signing_key_of,
+    signing_option,
     spin_option,
+    station_option,
+    truth_option,
     wait_option,
 )
 from bridge.link import refuse_rate_that_cannot_fit
@@ -46,6 +50,10 @@ Example:
     ),
     clock_option,
     speed_option,
+    click.option(
+        "--profile", type=click.Choice(["exact", "tolerant"]), default="exact", show_default=True,
+        help="Lockstep that waits for each answer of our controller, or bears with an autopilot that answers in its own time.",
+    ),
     realtime_option,
     spin_option,
     rate_option,
@@ -54,6 +62,9 @@ Example:
     delay_option,
     legs_option,
     wait_option,
+    station_option,
+    signing_option,
+    truth_option,
     run_motor_options,
     click.option(
         "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
@@ -68,6 +79,7 @@ def emulator(
     link: str,
     clock: str,
     speed: float | None,
+    profile: str,
     realtime: bool,
     spin_us: int | None,
     rate: float | None,
@@ -76,6 +88,9 @@ def emulator(
     delay_ns: int,
     legs: bool,
     wait_s: float,
+    station: str | None,
+    signing_key: Path | None,
+    truth_hz: float | None,
     motor: str,
     can: str,
     protocol: str | None,
@@ -103,8 +118,8 @@ def emulator(
     run_options = EmulatorOptions(
         link=link, clock=clock, speed=speed, out=out, wait_s=wait_s, spin_s=None if spin_us is None else spin_us * 1e-6,
         realtime=realtime, core=own_core(0) if core is None else core, delay_ns=delay_ns, legs=legs,
-        on_log_error=on_log_error,
-        motors=motors,
+        on_log_error=on_log_error, motors=motors, station=station, key=signing_key_of(signing_key), truth_hz=truth_hz,
+        profile=profile,
     )  # fmt: skip
     summary = run_emulator(chosen, run_options, report, stop)
     show_json(json_path, {"scenario": chosen.name, "rate_hz": chosen.rate_hz, "seed": chosen.seed, **summary})

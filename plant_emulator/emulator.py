@@ -10,13 +10,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bridge.endpoint import Endpoint
+from bridge.station import Station
 from plant_emulator.integrate import Plant
+from plant_emulator.on_request import OnRequest
 from plant_emulator.quick import QuickTicks
 from plant_emulator.safety import SafetyEnvelope
 from plant_emulator.sensors import InertialSensors
 from plant_emulator.truth import TruthWriter
 from protocol import mavlink_map
 from protocol.errors import DivergenceError
+from protocol.mavlink_codec import Frame
 from protocol.messages import ActuatorCommand, FloatArray
 from protocol.scenario import Scenario
 from protocol.streams import Due, stream
@@ -29,11 +32,17 @@ class Emulator:
     """Plant, sensors and safety envelope of one run.
 
     motors     drives behind a CAN bus, which then have the gears; None: motors and gears are the plant's
+    on_request what it says only when asked
     counters   of the safety envelope, and refused_commands: commands with a control that is not a number
     """
 
     def __init__(
-        self, scenario: Scenario, endpoint: Endpoint, truth: TruthWriter | None, motors: CanMotors | None = None
+        self,
+        scenario: Scenario,
+        endpoint: Endpoint,
+        truth: TruthWriter | None,
+        motors: CanMotors | None = None,
+        station: Station | None = None,
     ) -> None:
         self.plant = Plant(scenario, gears_elsewhere=motors is not None)
         self.motors = motors
@@ -42,6 +51,7 @@ class Emulator:
         self._endpoint = endpoint
         self._truth = truth
         self._inertial = InertialSensors(scenario.body.mass, scenario.world)
+        self.on_request = OnRequest(scenario, self.plant, self._inertial, motors, station)
         self._quick = QuickTicks(scenario, self.plant, self.safety, endpoint.writer, endpoint.reader)
         self._row = np.zeros(31)
         self._quiet_until_ns = 0
@@ -58,9 +68,17 @@ class Emulator:
         if self._gps.at(t_ns):
             place = self._inertial.geodetic(state.motion)
             frames.append(seal(mavlink_map.GPS, mavlink_map.encode_gps(t_ns, *place, state.motion[6:9])))
+        frames += [seal(*saying) for saying in self.on_request.due(t_ns)]
         frames.extend(self._quick.frames(t_ns))
-        self._quiet_until_ns = min(self._heartbeat.next_ns, self._gps.next_ns)
+        self._quiet_until_ns = min(self._heartbeat.next_ns, self._gps.next_ns, self.on_request.next_ns)
         return frames
+
+    def take_request(self, frame: Frame) -> bool:
+        """Obey or refuse a request over the loop's link; whether the frame was one. It is answered with the next tick."""
+        taken = self.on_request.take(frame)
+        if taken:
+            self._quiet_until_ns = 0
+        return taken
 
     def decode(self, payload: bytes) -> ActuatorCommand | None:
         """The command in a HIL_ACTUATOR_CONTROLS; None, counted, where a control is not a number."""
@@ -105,12 +123,19 @@ class Emulator:
             tau = self.motors.drive(t_ns, tau, acts_ns)  # the force behind the gears: the plant takes it as it is
         self.plant.command(acts_ns, tau)
 
-    def check_staleness(self, t_ns: int) -> None:
-        """Turn to the safe output where no command has come for too long."""
+    def hold(self, end_ns: int) -> None:
+        """Record the tick and let time pass with the plant where it is."""
+        t_ns = self.plant.t_ns
+        self.plant.record_and_advance(t_ns, self._quick.newest, self._row)
+        self._record(t_ns)
+        self.plant.t_ns = end_ns
+
+    def check_staleness(self, t_ns: int, delay_ns: int = 0) -> None:
+        """Turn to the safe output, as late as any command acts, where none has come for too long."""
         stale = self.safety.stale_output(t_ns)
         if stale is not None:
             expired_ns, output = stale
-            acts_ns = max(expired_ns, self.plant.t_ns)
+            acts_ns = max(expired_ns + delay_ns, self.plant.t_ns)
             self._drive(acts_ns, acts_ns, output)
 
     def advance(self, end_ns: int) -> None:
@@ -131,4 +156,10 @@ class Emulator:
     def all_counters(self) -> dict[str, int]:
         """Everything counted, by name."""
         of_motors = self.motors.counters if self.motors else {}
-        return {**self._endpoint.counters(), **self.safety.counters, **self.counters, **of_motors}
+        return {
+            **self._endpoint.counters(),
+            **self.safety.counters,
+            **self.counters,
+            **self.on_request.counters(),
+            **of_motors,
+        }

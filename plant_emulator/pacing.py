@@ -19,6 +19,7 @@ from plant_emulator.emulator import Emulator
 from protocol import mavlink_map
 from protocol.errors import DivergenceError, PeerLostError
 from protocol.mavlink_codec import Frame
+from protocol.messages import ActuatorCommand
 from protocol.streams import HEARTBEAT_TIMEOUT_NS
 from protocol.tlog import TlogWriter
 
@@ -121,6 +122,22 @@ class Lockstep(Pacing):
 
     def exchange(self, tick: int, t_ns: int) -> None:
         """One tick out, its one answer back."""
+        self.begin_tick(tick, t_ns)
+        received: list[Frame] = []
+        for attempt, wait_s in enumerate(RESEND_AFTER_S):
+            if attempt:
+                self.counters["resent"] += 1
+                self.stop.check()
+                self.endpoint.link.send(self._datagram)
+            if self.await_answer(tick, t_ns, round(wait_s * 1e9), received):
+                return
+        raise PeerLostError(
+            f"the controller at {self.endpoint.link.peer} gave no answer to the tick at t = {t_ns * 1e-9:.3f} s for 2 s: "
+            "see whether it still runs"
+        )
+
+    def begin_tick(self, tick: int, t_ns: int) -> None:
+        """Send the tick, unless it has left with the answer to the one before it."""
         self.stop.check()
         if not self._is_sent:
             self._pace(tick)
@@ -129,18 +146,6 @@ class Lockstep(Pacing):
             self.owe_log(t_ns // 1000, frames)
         self._is_sent = False
         self.settle_log()
-        received: list[Frame] = []
-        for attempt, wait_s in enumerate(RESEND_AFTER_S):
-            if attempt:
-                self.counters["resent"] += 1
-                self.stop.check()
-                self.endpoint.link.send(self._datagram)
-            if self._await_answer(tick, t_ns, round(wait_s * 1e9), received):
-                return
-        raise PeerLostError(
-            f"the controller at {self.endpoint.link.peer} gave no answer to the tick at t = {t_ns * 1e-9:.3f} s for 2 s: "
-            "see whether it still runs"
-        )
 
     def _pace(self, tick: int) -> None:
         """Wait for the tick's time, where there is a speed to keep."""
@@ -155,36 +160,34 @@ class Lockstep(Pacing):
         self.endpoint.link.send(datagram)
         self._datagram = datagram
 
-    def _await_answer(self, tick: int, t_ns: int, wait_ns: int, received: list[Frame]) -> bool:
+    def await_answer(self, tick: int, t_ns: int, wait_ns: int, received: list[Frame]) -> bool:
         """Whether the answer to the tick came in time; the plant has then moved on. `received` gathers its frames."""
         deadline_ns = self.clock.now_ns() + wait_ns
         timeout_s = wait_ns * 1e-9
         while True:
             data = self.endpoint.link.recv(timeout_s)
-            if data and not received and self._go_on(data, t_ns):
+            if data and not received and self.go_on(data, t_ns):
                 return True
             self._answered_ns = self.clock.now_ns()
             frames = self.endpoint.reader.read(data) if data else []
             for frame in frames:
                 received.append(frame)
                 if frame.message_id != mavlink_map.COMMAND.message_id or (frame.system, frame.component) != VEHICLE:
+                    self.emulator.take_request(frame)
                     continue
                 command = self.emulator.decode(frame.payload)
                 if command is not None and command.t_ns == t_ns:
                     self.latencies_ns.append(self._answered_ns - self._sent_ns)
-                    self._accept(tick, t_ns // 1000, received)
-                    self.emulator.act(t_ns, self._delay_ns, command)
-                    self.emulator.advance(t_ns + self.period_ns)
+                    self.accept(tick, t_ns // 1000, received)
+                    self.apply(t_ns, command)
                     return True
-                # A late copy of an earlier answer: neither it nor what came with it belongs to this tick.
-                self.counters["foreign"] += len(received)
-                received.clear()
+                self.take_stray(t_ns, command, received)
             remaining_ns = deadline_ns - self.clock.now_ns()
             if (timeout_s == 0.0 and not data) or remaining_ns < -wait_ns:
                 return False
             timeout_s = max(0.0, remaining_ns * 1e-9)  # at 0 one last look: the machine may have stalled
 
-    def _go_on(self, data: bytes, t_ns: int) -> bool:
+    def go_on(self, data: bytes, t_ns: int) -> bool:
         """Take a plain answer and send the next tick, which is plain too, at once: all else waits until it is on its way."""
         end_ns = t_ns + self.period_ns
         if end_ns >= self._ahead_until_ns:
@@ -206,14 +209,27 @@ class Lockstep(Pacing):
         self.owe_log(end_ns // 1000, (datagram[:middle], datagram[middle:]))
         return True
 
-    def _accept(self, tick: int, t_us: int, frames: list[Frame]) -> None:
+    def apply(self, t_ns: int, command: ActuatorCommand) -> None:
+        """Let the answer to the tick act, and move on."""
+        self.emulator.act(t_ns, self._delay_ns, command)
+        self.emulator.advance(t_ns + self.period_ns)
+
+    def take_stray(self, _t_ns: int, _command: ActuatorCommand | None, received: list[Frame]) -> None:
+        """Count a late copy of an earlier answer: neither it nor what came with it belongs to this tick."""
+        self.counters["foreign"] += len(received)
+        received.clear()
+
+    def accept(self, tick: int, t_us: int, frames: list[Frame]) -> None:
         """Log the frames of an answer. Numbers restart at t = 0, so the first answer's own tells how many belong to it."""
         if tick == 0:
-            belonging = frames[-(frames[-1].sequence + 1) :]
-            self.counters["foreign"] += len(frames) - len(belonging)
-            frames = belonging
+            theirs = [frame for frame in frames if (frame.system, frame.component) == VEHICLE]
+            strays = {id(frame) for frame in theirs[: -(frames[-1].sequence + 1)]}
+            self.counters["foreign"] += len(strays)
+            frames = [frame for frame in frames if id(frame) not in strays]
             self.endpoint.reader.restart_sequences([(*VEHICLE, frames[-1].sequence + 1)])
-        self.owe_log(t_us, [frame.raw for frame in frames])
+        once = list(dict.fromkeys(frame.raw for frame in frames))  # of a damaged answer and its copy some came twice
+        self.counters["foreign"] += len(frames) - len(once)
+        self.owe_log(t_us, once)
 
 
 class RealTime(Pacing):
@@ -363,6 +379,8 @@ class RealTime(Pacing):
     def _take(self, frame: Frame, arrival_ns: int, wall_ns: int, stamp_ns: int) -> None:
         """Take a frame that came at simulation time arrival_ns, wall_ns of this machine, and was stamped then (0: not)."""
         self.owe_log(self._unix_us(wall_ns), [frame.raw])
+        if self.emulator.take_request(frame):
+            return
         if (frame.system, frame.component) != VEHICLE:
             return
         self._heard_ns = self.clock.now_ns()

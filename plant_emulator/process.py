@@ -21,9 +21,13 @@ from bridge.rate import RateKeeper, choose_spin_ns
 from bridge.realtime import Settings, has_own_core, maybe_real_time, report_settings
 from bridge.ring_recorder import RingRecorder
 from bridge.sidecar import LinkOfLog
+from bridge.signed_link import signed
+from bridge.station import open_station
 from bridge.summary import make_folder, percentiles_us, refuse_existing_run, write_json, write_text
 from plant_emulator.emulator import Emulator
+from plant_emulator.on_request import OnRequest
 from plant_emulator.pacing import Lockstep, Pacing, Parts, RealTime
+from plant_emulator.tolerant import Tolerant, meet_autopilot
 from plant_emulator.truth import TruthWriter
 from protocol import mavlink_map
 from protocol.errors import FwavHilError, PeerMissingError, RunFolderError, UsageError
@@ -35,6 +39,7 @@ from protocol.tlog import TlogWriter
 if TYPE_CHECKING:
     from plant_emulator.can_motors import CanMotors
 
+STATION_FILE = "station_emulator.tlog"
 HELLO_PERIOD_S = 0.1
 PROGRESS_PERIOD_NS = 100_000_000
 FAREWELLS = 3
@@ -62,7 +67,9 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     lists, with `core` as the core to have. spin_s: in lockstep see `Link.spin_s` (None: 0); in real time how long to poll
     before each deadline (None: as measured with `realtime`, else 0).
     on_log_error: what a disk that refuses means for the run: "stop", or "continue" with what can be recorded.
-    motors: where the drives are, if not in the plant itself.
+    motors: where the drives are, if not in the plant itself. station: URI of a ground station's link. truth_hz: say the true
+    state on the link at this rate, as if its peer had asked for it. key: of signatures on
+    the loop's link. profile: of lockstep, "exact" or "tolerant".
     """
 
     link: str
@@ -77,6 +84,10 @@ class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
     realtime: bool = False
     core: int | None = None
     motors: MotorLink | None = None
+    station: str | None = None
+    key: bytes | None = None
+    truth_hz: float | None = None
+    profile: str = "exact"
 
 
 def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
@@ -84,6 +95,10 @@ def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, s
     if options.clock != "realtime" and (options.delay_ns or options.legs):
         raise UsageError(
             "--delay and --legs are of real time: add --clock realtime (in lockstep the delay is the scenario's, [delay])"
+        )
+    if options.profile == "tolerant" and (options.clock != "lockstep" or options.motors):
+        raise UsageError(
+            "--profile tolerant is of lockstep, with the gears in the plant: leave out --clock realtime and --motor can"
         )
     if options.legs and not options.out:
         raise UsageError("--legs needs a folder for the time stamps: add --out DIR")
@@ -94,7 +109,7 @@ def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, s
         if options.legs or options.delay_ns:
             link.stamp_receives()  # a delay counts from the arrival, not from when we got round to it
         delayed = DelayedLink(link, options.delay_ns, MonotonicClock()) if options.delay_ns else link
-        return fly(scenario, delayed, options, report, stop)
+        return fly(scenario, signed(delayed, options.key), options, report, stop)
 
 
 def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
@@ -111,14 +126,27 @@ def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report
         endpoint = Endpoint(link, VEHICLE[0], scenario.wire.emulator_component)
         with (
             _motors(scenario, options, report, stop) as motors,
+            open_station(
+                options.station,
+                (endpoint.writer.system, endpoint.writer.component),
+                _heartbeat,
+                options.out / STATION_FILE if options.out else None,
+                options.wait_s,
+                stop,
+            ) as station,
             maybe_real_time(options.core, wanted=options.realtime) as settings,
         ):
-            emulator = Emulator(scenario, endpoint, truth, motors)
+            emulator = Emulator(scenario, endpoint, truth, motors, station)
+            if options.truth_hz:
+                emulator.on_request.ask_for_truth(options.truth_hz)
             report_settings(report, settings)
             parts = Parts(emulator, endpoint, log, MonotonicClock(), stop, scenario.period_ns)
             pacing = _pacing(scenario, options, parts, settings)
             report({"event": "waiting", "link": link.uri})
-            meet_controller(scenario, options.wait_s, endpoint, stop)
+            if isinstance(pacing, Tolerant):
+                meet_autopilot(options.wait_s, endpoint, stop, emulator.on_request)
+            else:
+                meet_controller(scenario, options.wait_s, endpoint, stop, emulator.on_request)
             report({"event": "started", "peer": link.peer})
             if options.legs and isinstance(pacing, RealTime):
                 pacing.legs = LegTable(TICK_COLUMNS), LegTable(ANSWER_COLUMNS)
@@ -206,10 +234,14 @@ def _pacing(scenario: Scenario, options: EmulatorOptions, parts: Parts, settings
         through = not wakes and parts.endpoint.link.stamp_receives()
         return RealTime(parts, ticks=scenario.ticks, spin_ns=spin_ns, sleeps_through=through)
     keeper = RateKeeper(parts.clock, round(scenario.period_ns / options.speed)) if options.speed else None
+    if options.profile == "tolerant":
+        return Tolerant(parts, ticks=scenario.ticks, delay_ns=scenario.delay_ns, keeper=keeper, wait_s=options.wait_s)
     return Lockstep(parts, ticks=scenario.ticks, delay_ns=scenario.delay_ns, keeper=keeper)
 
 
-def meet_controller(scenario: Scenario, wait_s: float, endpoint: Endpoint, stop: StopFlag) -> None:
+def meet_controller(
+    scenario: Scenario, wait_s: float, endpoint: Endpoint, stop: StopFlag, on_request: OnRequest | None = None
+) -> None:
     """Hold the plant at t = 0 until a controller with the same scenario says it is armed. Raises PeerError, Interrupted."""
     digest = scenario.digest()
     agreed = heard = False
@@ -224,7 +256,13 @@ def meet_controller(scenario: Scenario, wait_s: float, endpoint: Endpoint, stop:
         ]
         if heard and due.at(now_ns):
             endpoint.send(hello)
-        for frame in endpoint.receive(HELLO_PERIOD_S):
+        received = endpoint.receive(HELLO_PERIOD_S)
+        if on_request:
+            for frame in received:
+                on_request.take(frame)
+            if replies := on_request.replies():
+                endpoint.send(endpoint.seal(*reply) for reply in replies)
+        for frame in received:
             if (frame.system, frame.component) != VEHICLE:
                 continue
             if not heard:
@@ -249,6 +287,10 @@ def meet_controller(scenario: Scenario, wait_s: float, endpoint: Endpoint, stop:
         f"no controller came to {uri} within {wait_s:g} s: start one with `fwav-hil controller "
         f"SCENARIO --link {uri.replace('in://', 'out://', 1)}`, or wait longer with --wait"
     )
+
+
+def _heartbeat() -> bytes:
+    return mavlink_map.encode_emulator_heartbeat()
 
 
 def _run_ticks(

@@ -8,7 +8,7 @@ A payload that holds bad data (NaN where a number must be, a quaternion that is 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -218,15 +218,15 @@ def encode_gps(t_ns: int, latitude_deg: float, longitude_deg: float, altitude: f
 
     What a field cannot hold is held at its end: a plant far away is no reason to stop.
     """
-    north, east, down = (_saturated(100.0 * v, 32767) for v in velocity)
-    speed = _saturated(100.0 * math.hypot(velocity[0], velocity[1]), 65534)
+    north, east, down = (saturated(100.0 * v, 32767) for v in velocity)
+    speed = saturated(100.0 * math.hypot(velocity[0], velocity[1]), 65534)
     course = round(math.degrees(math.atan2(velocity[1], velocity[0])) * 100.0) % 36000 if speed else 65535
     return GPS.pack_fields(
         time_usec=t_ns // 1000,
         fix_type=3,
-        lat=_saturated(latitude_deg * 1e7, 2**31 - 1),
-        lon=_saturated(longitude_deg * 1e7, 2**31 - 1),
-        alt=_saturated(altitude * 1000.0, 2**31 - 1),
+        lat=saturated(latitude_deg * 1e7, 2**31 - 1),
+        lon=saturated(longitude_deg * 1e7, 2**31 - 1),
+        alt=saturated(altitude * 1000.0, 2**31 - 1),
         eph=30,
         epv=40,
         vel=speed,
@@ -238,7 +238,8 @@ def encode_gps(t_ns: int, latitude_deg: float, longitude_deg: float, altitude: f
     )
 
 
-def _saturated(value: float, limit: int) -> int:
+def saturated(value: float, limit: int) -> int:
+    """The nearest whole number within +-limit."""
     return round(max(-limit, min(limit, value)))
 
 
@@ -297,11 +298,16 @@ def heartbeat_is_ending(payload: bytes) -> bool:
     return bool(HEARTBEAT.unpack_fields(payload)["system_status"] == common.MAV_STATE_POWEROFF)
 
 
-def encode_version(digest: bytes) -> bytes:
-    """AUTOPILOT_VERSION payload with the scenario's digest (8 bytes) as flight_custom_version."""
-    return VERSION.pack_fields(
-        capabilities=common.MAV_PROTOCOL_CAPABILITY_MAVLINK2, flight_custom_version=digest, flight_sw_version=1 << 16
-    )
+def encode_version(digest: bytes, *, has_parameters: bool = False) -> bytes:
+    """AUTOPILOT_VERSION payload with the scenario's digest (8 bytes) as flight_custom_version.
+
+    has_parameters: the sender has some, floats as floats and integers bytewise.
+    """
+    capabilities = common.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    if has_parameters:
+        capabilities |= common.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+        capabilities |= common.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    return VERSION.pack_fields(capabilities=capabilities, flight_custom_version=digest, flight_sw_version=1 << 16)
 
 
 def decode_version(payload: bytes) -> bytes:
@@ -334,29 +340,6 @@ def encode_attitude_target(t_ns: int, q: FloatArray) -> bytes:
     return ATTITUDE_TARGET.pack_fields(time_boot_ms=t_ns // 1_000_000, q=attitude, type_mask=ignored)
 
 
-class ArmRequest(NamedTuple):
-    """A COMMAND_LONG as the controller reads it; arm is None where it asks for neither arming nor disarming."""
-
-    command: int
-    target_system: int
-    target_component: int
-    arm: bool | None
-
-
-def decode_arm_request(payload: bytes) -> ArmRequest:
-    """The request in a COMMAND_LONG; param1 must be 1 or 0, while NaN is legal in the parameters that are not used."""
-    values = COMMAND_LONG.unpack_fields(payload)
-    command = int(values["command"])
-    arm = {1.0: True, 0.0: False}.get(values["param1"]) if command == ARM_DISARM else None
-    return ArmRequest(command, int(values["target_system"]), int(values["target_component"]), arm)
-
-
-def encode_acknowledgement(command: int, *, accepted: bool) -> bytes:
-    """COMMAND_ACK payload: accepted; else denied, or unsupported where it was no arming command."""
-    refused = common.MAV_RESULT_DENIED if command == ARM_DISARM else common.MAV_RESULT_UNSUPPORTED
-    return COMMAND_ACK.pack_fields(command=command, result=common.MAV_RESULT_ACCEPTED if accepted else refused)
-
-
 def encode_timesync(answer_ns: int, asked_ns: int) -> bytes:
     """TIMESYNC payload: tc1 (0 in a question) and ts1, both ns of the clock of who fills them in."""
     return TIMESYNC.pack_fields(tc1=answer_ns, ts1=asked_ns)
@@ -367,8 +350,6 @@ def decode_timesync(payload: bytes) -> tuple[int, int]:
     values = TIMESYNC.unpack_fields(payload)
     return int(values["tc1"]), int(values["ts1"])
 
-
-ARM_DISARM = common.MAV_CMD_COMPONENT_ARM_DISARM
 
 _CAN_EXTENDED = 1 << 31
 _CAN_REMOTE = 1 << 30
@@ -388,18 +369,3 @@ def decode_can_frame(payload: bytes) -> CanFrame | None:
     if values["bus"] != 0 or values["len"] > LONGEST_DATA or (not extended and can_id >= STANDARD_IDS):
         return None
     return CanFrame(can_id, b"" if remote else bytes(values["data"][: values["len"]]), extended, remote)
-
-
-def decode_can_forward(payload: bytes) -> int | None:
-    """The bus (from 1 on; 0 ends it) that a COMMAND_LONG asks to have forwarded; None where it asks for something else."""
-    values = COMMAND_LONG.unpack_fields(payload)
-    bus = values["param1"]
-    if values["command"] != common.MAV_CMD_CAN_FORWARD or not math.isfinite(bus):
-        return None
-    return int(bus)
-
-
-def encode_can_forward_acknowledgement(*, accepted: bool) -> bytes:
-    """COMMAND_ACK payload for MAV_CMD_CAN_FORWARD."""
-    result = common.MAV_RESULT_ACCEPTED if accepted else common.MAV_RESULT_DENIED
-    return COMMAND_ACK.pack_fields(command=common.MAV_CMD_CAN_FORWARD, result=result)

@@ -48,6 +48,17 @@ STREAMS = (
     Stream("POSITION_TARGET_LOCAL_NED", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
     Stream("ATTITUDE_TARGET", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
     Stream(
+        "PARAM_VALUE",
+        End.CONTROLLER,
+        None,
+        "gains, scales, limits, gears: each once at the start, for the log, and when changed; to a ground station on request",
+    ),
+    Stream("PARAM_REQUEST_LIST", End.STATION, None, "to the controller, on its station's link: all of them"),
+    Stream("PARAM_REQUEST_READ", End.STATION, None, "one of them"),
+    Stream("PARAM_SET", End.STATION, None, "a gain, while disarmed"),
+    Stream("PARAM_ERROR", End.CONTROLLER, None, "why one was not given or not set"),
+    Stream("FILE_TRANSFER_PROTOCOL", End.CONTROLLER, None, "the refusal of files, for which stations ask first"),
+    Stream(
         "TIMESYNC", End.BOTH, 1.0, "real time only: how far the other end's clock is ahead; 20 Hz for the first ten"
     ),
     Stream(
@@ -56,8 +67,23 @@ STREAMS = (
         None,
         "on the tap's own link (`--tap`): the motor bus, while 32000 is renewed within 5 s",
     ),
-    Stream("COMMAND_LONG", End.STATION, None, "to the controller: 400 (arm, disarm)"),
-    Stream("COMMAND_ACK", End.CONTROLLER, None, "the answer to it"),
+    Stream(
+        "HIL_STATE_QUATERNION", End.EMULATOR, None, "the true state, on request (511, 512, `--truth`); no law reads it"
+    ),
+    Stream("ODOMETRY", End.EMULATOR, None, "the same to the full: float metres, body rates"),
+    Stream(
+        "RAW_RPM",
+        End.EMULATOR,
+        None,
+        "drives on a bus: how fast each says it turns; 10 Hz to a ground station, or on request",
+    ),
+    Stream(
+        "COMMAND_LONG",
+        End.STATION,
+        None,
+        "400 (arm, disarm) to the controller; 511, 512 (a message at a rate, once) and 32000 (CAN) to the emulator",
+    ),
+    Stream("COMMAND_ACK", End.BOTH, None, "the answer to it"),
 )
 
 

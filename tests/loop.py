@@ -46,13 +46,20 @@ def fly_both(
     motors: MotorLink | None = None,
     trigger: str = "sample",
     spin_s: float | None = None,
+    station: str | None = None,
+    truth_hz: float | None = None,
+    controller_station: str | None = None,
 ) -> Ends:
     """Run both ends to their end."""
     theirs = controller_scenario or scenario
-    emulator = EmulatorOptions(link="-", clock=clock, out=out, wait_s=wait_s, legs=legs, motors=motors, spin_s=spin_s)
+    emulator = EmulatorOptions(
+        link="-", clock=clock, out=out, wait_s=wait_s, legs=legs, motors=motors, spin_s=spin_s, station=station,
+        truth_hz=truth_hz,
+    )  # fmt: skip
     service_options = ControllerOptions(
-        link="-", clock=clock, out=out, wait_s=wait_s, arm=arm, legs=legs, trigger=trigger, spin_s=spin_s
-    )
+        link="-", clock=clock, out=out, wait_s=wait_s, arm=arm, legs=legs, trigger=trigger, spin_s=spin_s,
+        station=controller_station,
+    )  # fmt: skip
     law = make_law(theirs.law, theirs)
     plant_emulator.process.warm_up(scenario)
     controller_process.warm_up(law)

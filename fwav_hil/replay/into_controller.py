@@ -12,6 +12,7 @@ from bridge.endpoint import VEHICLE, Endpoint
 from bridge.link import Link, open_link
 from bridge.process import StopFlag
 from controller.laws import make_law, refuse_on_a_link
+from controller.parameters import followed
 from fwav_hil.replay.difference import Difference
 from fwav_hil.replay.other_end import other_end
 from fwav_hil.replay.recorded import Recorded, Tick
@@ -30,7 +31,11 @@ def replay_in_process(run: Recorded) -> Difference:
     law = make_law(run.scenario.law, run.scenario)
     state, was_armed = law.start(), False
     answers: dict[int, bytes] = {}
+    scenario = run.scenario
     for tick in run.ticks:
+        if (gains := followed(scenario, tick.parameters)) is not scenario:
+            scenario = gains  # set while disarmed: the law starts again with them
+            law.adopt(make_law(law.name, gains))
         sample = mavlink_map.decode_pose(tick.pose)
         if sample is None or sample.t_ns != tick.t_ns or tick.t_ns in answers:
             continue  # as the controller does: no pose, no sample; a tick sent again is answered as before

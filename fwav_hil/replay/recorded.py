@@ -8,11 +8,13 @@ from typing import NamedTuple
 from bridge.endpoint import VEHICLE
 from bridge.sidecar import read_sidecar
 from bridge.summary import read_json
+from controller.parameters import followed
 from fwav_hil.logs.choice import open_telemetry
 from protocol import mavlink_map
 from protocol.errors import LogError, UsageError
 from protocol.log_scan import Scan
 from protocol.mavlink_codec import Frame
+from protocol.parameter_map import VALUE, decode_value
 from protocol.scenario import Scenario, find_scenario, load_scenario, with_overrides
 
 
@@ -24,6 +26,11 @@ class Tick(NamedTuple):
     datagram: bytes
     pose: bytes
     answers: list[tuple[int, Frame]]
+
+    @property
+    def parameters(self) -> list[tuple[str, float | None]]:
+        """(name, value) of each parameter that the controller said."""
+        return [decode_value(frame.payload) for _, frame in self.answers if frame.message_id == VALUE.message_id]
 
     @property
     def answer(self) -> bytes:
@@ -62,6 +69,7 @@ def recorded_run(log: Path, scenario_name: str | None, law: str | None) -> Recor
             f"{path} holds no sample (ATT_POS_MOCAP with its HIL_SENSOR) of {VEHICLE[0]}/{scenario.wire.emulator_component}:"
             " only logs of this project's runs can be replayed into its ends"
         )
+    scenario = followed(scenario, ticks[0].parameters)  # gains that a ground station had set before the start
     return Recorded(path, with_overrides(scenario, law=law), clock == "lockstep", ticks, commands)
 
 

@@ -12,6 +12,7 @@ from controller.vehicle import Vehicle
 from protocol import mavlink_map
 from protocol.errors import ScenarioMismatchError
 from protocol.mavlink_codec import Frame, FrameReader, FrameWriter, Layout
+from protocol.requests import ARM_DISARM
 
 DIGEST = b"12345678"
 
@@ -21,7 +22,7 @@ def frame(system: int, component: int, message: Layout, payload: bytes) -> Frame
     return read
 
 
-def request(param1: float, *, target: tuple[int, int] = (1, 1), command: int = mavlink_map.ARM_DISARM) -> Frame:
+def request(param1: float, *, target: tuple[int, int] = (1, 1), command: int = ARM_DISARM) -> Frame:
     payload = mavlink_map.COMMAND_LONG.pack_fields(
         command=command, param1=param1, param2=math.nan, target_system=target[0], target_component=target[1]
     )

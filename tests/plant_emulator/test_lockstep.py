@@ -23,6 +23,7 @@ from protocol.errors import (
     ScenarioMismatchError,
 )
 from protocol.mavlink_codec import FrameWriter
+from protocol.requests import ARM_DISARM
 from protocol.tlog import read_tlog
 from tests.loop import fly_both, scenario_of
 
@@ -167,7 +168,7 @@ def test_an_emulator_whose_controller_does_not_arm_says_so() -> None:
 def test_a_ground_station_arms_the_controller(tmp_path: Path) -> None:
     near, far = memory_pair()
     station = FrameWriter(255, 190)
-    arm = mavlink_map.COMMAND_LONG.pack_fields(command=mavlink_map.ARM_DISARM, param1=1.0, param2=float("nan"))
+    arm = mavlink_map.COMMAND_LONG.pack_fields(command=ARM_DISARM, param1=1.0, param2=float("nan"))
     frame = station.seal(mavlink_map.COMMAND_LONG, arm)
     # The station speaks through the emulator's end of the link, once the controller has had time to be refused.
     with near, far:

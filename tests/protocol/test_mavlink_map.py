@@ -404,28 +404,6 @@ class TestReference:
         assert target.type_mask == 1 + 2 + 4 + 64
 
 
-class TestArming:
-    @pytest.mark.parametrize(
-        ("param1", "arm"), [(1.0, True), (0.0, False), (math.nan, None), (math.inf, None), (0.5, None)]
-    )
-    @pytest.mark.parametrize("unused", [0.0, math.nan, math.inf])
-    def test_nan_is_legal_in_the_unused_parameters(self, param1: float, arm: bool | None, unused: float) -> None:
-        # MAVSDK arms with param2 = NaN.
-        message = common.MAVLink_command_long_message(1, 1, 400, 0, param1, *[unused] * 6)
-        (frame,) = FrameReader(is_datagram=True).read(message.pack(common.MAVLink(None)))
-        assert mavlink_map.decode_arm_request(frame.payload) == (400, 1, 1, arm)
-        assert mavlink_map.ARM_DISARM == 400
-
-    @pytest.mark.parametrize("command", [0, 400, 511, 65535])
-    @pytest.mark.parametrize(("accepted", "result"), [(True, 0), (False, 3)])
-    def test_the_answer_names_the_command_and_the_outcome(self, command: int, accepted: bool, result: int) -> None:
-        payload = mavlink_map.encode_acknowledgement(command, accepted=accepted)
-        message = parsed(mavlink_map.COMMAND_ACK, payload)
-        if not accepted and command == mavlink_map.ARM_DISARM:
-            result = common.MAV_RESULT_DENIED  # a command it knows, and does not obey now
-        assert (message.get_type(), message.command, message.result) == ("COMMAND_ACK", command, result)
-
-
 def test_decoders_take_any_length_of_payload() -> None:
     # A foreign sender may cut a payload anywhere, or fill it with what its newer dialect has.
     payload = random.Random(1).randbytes(255)
@@ -437,7 +415,6 @@ def test_decoders_take_any_length_of_payload() -> None:
             mavlink_map.heartbeat_is_armed,
             mavlink_map.heartbeat_is_ending,
             mavlink_map.decode_version,
-            mavlink_map.decode_arm_request,
         ):
             decode(payload[:length])
         mavlink_map.decode_command(payload[:length], SCALE)

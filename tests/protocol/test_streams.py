@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol import mavlink_map
+from protocol import file_transfer, mavlink_map, parameter_map, truth_map
 from protocol.mavlink_codec import Layout, layout
 from protocol.streams import HEARTBEAT_TIMEOUT_NS, STREAMS, Due, End, Stream, markdown_table, stream
 
@@ -20,7 +20,8 @@ def dues(rate_hz: float, times_ns: list[int]) -> list[int]:
 
 class TestTable:
     def test_it_names_every_message_that_the_mapping_knows_and_no_other(self) -> None:
-        mapped = {value.name for value in vars(mavlink_map).values() if isinstance(value, Layout)}
+        maps = (mavlink_map, truth_map, parameter_map, file_transfer)
+        mapped = {value.name for one in maps for value in vars(one).values() if isinstance(value, Layout)}
         assert {row.message for row in STREAMS} == mapped
         assert len(STREAMS) == len(mapped)
 
@@ -34,8 +35,8 @@ class TestTable:
         assert found.rule
 
     def test_a_message_without_a_row_is_refused(self) -> None:
-        with pytest.raises(KeyError, match="ODOMETRY"):
-            stream("ODOMETRY")
+        with pytest.raises(KeyError, match="GPS_RAW_INT"):
+            stream("GPS_RAW_INT")
 
     def test_feedback_and_tick_come_from_the_emulator_and_commands_from_the_controller(self) -> None:
         assert stream("ATT_POS_MOCAP").sender is End.EMULATOR

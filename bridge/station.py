@@ -1,0 +1,115 @@
+"""A ground station's link: heard without waiting, told heartbeats by the wall clock, and recorded.
+
+The station may come, go and come again: nothing it does ends a run. Frames carry numbers of this link's own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from bridge.clock import Clock, MonotonicClock
+from bridge.link import Link
+from bridge.process import StopFlag, open_patiently
+from bridge.summary import make_folder
+from protocol import mavlink_map
+from protocol.errors import LinkError
+from protocol.mavlink_codec import Frame, FrameReader, FrameWriter, Layout
+from protocol.streams import Due, stream
+from protocol.tlog import TlogWriter
+
+POLL_HZ = 50.0
+"""How often an end of the loop looks at its station's link, in simulation time."""
+_MOST_AT_ONCE = 64
+
+
+@contextlib.contextmanager
+def open_station(
+    uri: str | None,
+    who: tuple[int, int],
+    heartbeat: Callable[[], bytes],
+    record: Path | None,
+    wait_s: float,
+    stop: StopFlag,
+) -> Iterator[Station | None]:
+    """The station at a link, its words recorded in the file `record`; None where no link is named.
+
+    Raises what `open_patiently` raises, and RunFolderError.
+    """
+    if uri is None:
+        yield None
+        return
+    with contextlib.ExitStack() as stack:
+        link = stack.enter_context(open_patiently(uri, wait_s, stop))
+        log = None
+        if record:
+            make_folder(record.parent)
+            log = TlogWriter(record)
+            stack.callback(log.close)
+        yield Station(link, who, MonotonicClock(), heartbeat, log)
+
+
+class Station:
+    """One end of a station's link, as the component `who`.
+
+    heartbeat: the payload of this component's. log: where all that is said is kept, or None.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        who: tuple[int, int],
+        clock: Clock,
+        heartbeat: Callable[[], bytes],
+        log: TlogWriter | None = None,
+    ) -> None:
+        self._link = link
+        self._clock = clock
+        self._heartbeat = heartbeat
+        self._due = Due(stream("HEARTBEAT").rate_hz or 1.0)
+        self._reader = FrameReader(is_datagram=link.is_datagram, follow_sequence=False)
+        self._writer = FrameWriter(*who)
+        self._log = log
+        self.departures = 0
+        """How often a station has left, or had to make room."""
+        self.t_us = 0
+        """The time under which frames are logged."""
+
+    def poll(self) -> list[Frame]:
+        """The frames that came since the last poll; a heartbeat is sent if one is due."""
+        frames: list[Frame] = []
+        try:
+            if self._due.at(self._clock.now_ns()):
+                self.say(mavlink_map.HEARTBEAT, self._heartbeat())
+            for _ in range(_MOST_AT_ONCE):
+                data = self._link.recv(0.0)
+                if not data:
+                    break
+                frames += self._reader.read(data)
+        except LinkError:
+            self.release()
+        if self._log:
+            for frame in frames:
+                self._log.write(self.t_us, frame.raw)
+        return frames
+
+    def say(self, message: Layout, payload: bytes) -> None:
+        """Send a frame, which is lost where nobody is there."""
+        frame = self._writer.seal(message, payload)
+        try:
+            self._link.send(frame)
+        except LinkError:
+            self.release()
+        if self._log:
+            self._log.write(self.t_us, frame)
+
+    def release(self) -> None:
+        """Make room for another station."""
+        self.departures += 1
+        self._link.release_peer()
+
+    def counters(self) -> dict[str, int]:
+        """What the link and its reader have counted, each name beginning with station_."""
+        counted = {**self._link.stats.as_dict(), **self._reader.counters}
+        return {f"station_{name}": count for name, count in counted.items()}
