@@ -26,7 +26,7 @@ from protocol.tlog import TlogWriter
 RESEND_AFTER_S = (0.010, 0.020, 0.040, 0.080, 0.160, 0.320, 0.640, 0.730)
 """Waits of the exact profile: after each the tick is sent again; after the last, 2 s in all, the run ends."""
 
-_LOG_PERIOD_NS = 5_000_000
+_LOG_PERIOD_NS = 10_000_000
 """How often the log of a real-time run is handed over: what a kill -9 may cost."""
 
 _MOST_IN_A_PERIOD = 1000
@@ -362,8 +362,9 @@ class RealTime(Pacing):
         self._send(end_ns, datagram)
         self._is_sent = True
         self.emulator.settle(t_ns, t_ns + since_ns)
-        self.owe_log(self._unix_us(stamp_ns), [data])
-        self.owe_log(unix_time_us(), (datagram[:middle], datagram[middle:]))
+        now_us = unix_time_us()
+        self.owe_log(now_us - (self._sent[end_ns] - stamp_ns) // 1000, (data,))
+        self.owe_log(now_us, (datagram[:middle], datagram[middle:]))
         self._answered(t_ns, stamp_ns)
         return True
 
