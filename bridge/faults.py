@@ -11,6 +11,9 @@ from protocol.errors import LinkClosedError
 _SPIN_NS = 200_000
 """The last of a delay is polled through: a sleep would end up to this much late, which would be a delay of its own."""
 
+_FETCHED_AT_ONCE = 1000
+"""A bound: a peer that floods the link must not keep `recv` from ending."""
+
 
 class DelayedLink(Link):
     """A link whose receiving end gets everything later by a fixed wall time, in the order in which it came.
@@ -31,7 +34,9 @@ class DelayedLink(Link):
 
     def recv(self, timeout_s: float) -> bytes | None:
         """What the link delivered a delay ago, or None; see `Link.recv`."""
-        give_up_ns = self._clock.now_ns() + round(max(0.0, timeout_s) * 1e9)
+        if timeout_s <= 0.0:
+            return self._take_stock()
+        give_up_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         while True:
             if self._closed:
                 raise LinkClosedError(f"{self.uri} is closed on this end")
@@ -50,16 +55,32 @@ class DelayedLink(Link):
             if now_ns >= give_up_ns:
                 return None
 
-    def _fetch(self, timeout_s: float) -> None:
-        """Take in what has come to the link."""
+    def _take_stock(self) -> bytes | None:
+        """What is due, without a wait, after all that has come is taken in."""
+        if self._closed:
+            raise LinkClosedError(f"{self.uri} is closed on this end")
+        for _ in range(_FETCHED_AT_ONCE):
+            if self._ended_by or not self._fetch(0.0):
+                break
+        if self._held and self._held[0][0] <= self._clock.now_ns():
+            _, self.received_ns, data = self._held.popleft()
+            return data
+        if self._ended_by and not self._held:
+            raise self._ended_by
+        return None
+
+    def _fetch(self, timeout_s: float) -> bool:
+        """Take in what comes to the link next; whether anything came."""
         try:
             data = self._link.recv(timeout_s)
         except LinkClosedError as error:
             self._ended_by = error
-            return
-        if data is not None:
-            came_ns = self._link.received_ns or self._clock.now_ns()
-            self._held.append((came_ns + self._delay_ns, self._link.received_ns, data))
+            return False
+        if data is None:
+            return False
+        came_ns = self._link.received_ns or self._clock.now_ns()
+        self._held.append((came_ns + self._delay_ns, self._link.received_ns, data))
+        return True
 
     @property
     def spin_s(self) -> float:

@@ -241,6 +241,7 @@ class RealTime(Pacing):
     sleeps_through   the plant moves at the end of a period only, so where the link stamps what it receives (`Link.received_ns`)
                      the period is slept through, and what came is taken at its end, each at the time of its stamp. Else each
                      command wakes the process, and came when it woke.
+    added_delay_ns   of the link (`DelayedLink`): its stamps are so much older than what it hands on
 
     counters   late, slipped    of the schedule (`RateKeeper`)
                unanswered       ticks whose command had not come when the next one was due
@@ -258,10 +259,12 @@ class RealTime(Pacing):
         ticks: int,
         spin_ns: int = 0,
         sleeps_through: bool = False,
+        added_delay_ns: int = 0,
     ) -> None:
         super().__init__(parts)
         self._keeper = self.keeper = RateKeeper(self.clock, self.period_ns, spin_ns)
         self._sleeps_through = sleeps_through
+        self._added_delay_ns = added_delay_ns
         self._ahead_until_ns = ticks * self.period_ns if self.emulator.safety.outlasts(self.period_ns) else 0
         """Ticks before this time may be sent together with the taking of a plain answer to the one before them."""
         self._log_every = max(1, _LOG_PERIOD_NS // self.period_ns)
@@ -271,7 +274,7 @@ class RealTime(Pacing):
         self._begun = False
         self.time_sync = TimeSync(self.endpoint, self.clock)
         self.legs: tuple[LegTable, LegTable] | None = None
-        self._heard_ns = self._due_ns = self.clock.now_ns()
+        self._heard_ns = self._due_ns = self._woke_ns = self.clock.now_ns()
         self.counters = {"unanswered": 0, "old_commands": 0, "repeated": 0, "unknown_echoes": 0}
 
     def exchange(self, tick: int, t_ns: int) -> None:
@@ -279,14 +282,12 @@ class RealTime(Pacing):
         self.stop.check()
         if tick == 0:
             self._keeper.start()
-            self._heard_ns = self._due_ns = self.clock.now_ns()
+            self._heard_ns = self._due_ns = self._woke_ns = self.clock.now_ns()
         if not self._is_sent:
-            woke_ns = self.clock.now_ns()
             frames = self.emulator.sense(t_ns)
             self._send(t_ns, b"".join(frames))
             self.owe_log(unix_time_us(), frames)
-            if self.legs:
-                self.legs[0].add(t_ns, self._due_ns, woke_ns, self._sent[t_ns])
+            self._note_tick(t_ns)
         self._is_sent = False
         if tick % self._log_every == 0:
             self.settle_log()
@@ -296,6 +297,7 @@ class RealTime(Pacing):
         self._due_ns = self._keeper.deadline_ns
         if self._sleeps_through:
             self._keeper.sleep()
+            self._woke_ns = self.clock.now_ns()
             self._keeper.tick()
             if self._take_what_came(t_ns, begun_ns):
                 return
@@ -306,6 +308,7 @@ class RealTime(Pacing):
                 for frame in received:
                     stamp_ns = self.endpoint.link.received_ns
                     self._take(frame, t_ns + self._since(begun_ns, arrived_ns), arrived_ns, stamp_ns)
+            self._woke_ns = self.clock.now_ns()
             self._keeper.tick()
         if self._newest_ns < t_ns:
             self.counters["unanswered"] += 1
@@ -324,13 +327,12 @@ class RealTime(Pacing):
             data = link.recv(0.0)
             if not data:
                 break
-            stamp_ns = link.received_ns or self.clock.now_ns()
-            if self._go_on(t_ns, begun_ns, stamp_ns, data):
-                return (
-                    True  # more may have come, but hardly ever has: it waits for the next tick's turn, with its stamp
-                )
+            stamp_ns = link.received_ns
+            came_ns = stamp_ns + self._added_delay_ns if stamp_ns else self.clock.now_ns()
+            if self._go_on(t_ns, begun_ns, came_ns, data):
+                return True  # should more have come, it waits for the next tick's turn, with its stamp
             for frame in self.endpoint.reader.read(data):
-                self._take(frame, t_ns + self._since(begun_ns, stamp_ns), stamp_ns, stamp_ns)
+                self._take(frame, t_ns + self._since(begun_ns, came_ns), came_ns, stamp_ns)
         return False
 
     def _since(self, begun_ns: int, moment_ns: int) -> int:
@@ -345,12 +347,12 @@ class RealTime(Pacing):
         """The time for the log of a moment that has just passed."""
         return unix_time_us() - (self.clock.now_ns() - moment_ns) // 1000
 
-    def _go_on(self, t_ns: int, begun_ns: int, stamp_ns: int, data: bytes) -> bool:
+    def _go_on(self, t_ns: int, begun_ns: int, came_ns: int, data: bytes) -> bool:
         """Take a plain answer to the tick, move the plant, and send the next tick, which is plain too: all else waits."""
         end_ns = t_ns + self.period_ns
         if end_ns >= self._ahead_until_ns or not self._begun or self._newest_ns == t_ns:
             return False
-        since_ns = self._since(begun_ns, stamp_ns)
+        since_ns = self._since(begun_ns, came_ns)
         try:
             following = self.emulator.go_on(data, t_ns, end_ns, since_ns)
         except DivergenceError:
@@ -363,9 +365,11 @@ class RealTime(Pacing):
         self._is_sent = True
         self.emulator.settle(t_ns, t_ns + since_ns)
         now_us = unix_time_us()
-        self.owe_log(now_us - (self._sent[end_ns] - stamp_ns) // 1000, (data,))
+        self.owe_log(now_us - (self._sent[end_ns] - came_ns) // 1000, (data,))
         self.owe_log(now_us, (datagram[:middle], datagram[middle:]))
-        self._answered(t_ns, stamp_ns)
+        self._answered(t_ns, came_ns)
+        self._note_tick(end_ns)
+        self._note_answer(t_ns, self.endpoint.link.received_ns, came_ns, t_ns + since_ns)
         return True
 
     def _answered(self, t_ns: int, arrived_ns: int) -> None:
@@ -409,9 +413,18 @@ class RealTime(Pacing):
             return
         self._answered(command.t_ns, wall_ns)
         self.emulator.act(arrival_ns, 0, command)
+        self._note_answer(command.t_ns, stamp_ns, wall_ns, arrival_ns)
+
+    def _note_tick(self, t_ns: int) -> None:
+        """Note when the tick of t_ns, just sent, was where."""
         if self.legs:
-            applied_ns = self.clock.now_ns()
-            self.legs[1].add(command.t_ns, stamp_ns, wall_ns, applied_ns, arrival_ns)
+            self.legs[0].add(t_ns, self._due_ns, self._woke_ns, self._sent[t_ns])
+
+    def _note_answer(self, t_ns: int, stamp_ns: int, came_ns: int, arrival_ns: int) -> None:
+        """Note when the command for the tick of t_ns was where; slept through, it is applied the moment it came."""
+        if self.legs:
+            applied_ns = came_ns if self._sleeps_through else self.clock.now_ns()
+            self.legs[1].add(t_ns, stamp_ns, came_ns, applied_ns, arrival_ns)
 
     def _say(self, frame: bytes) -> None:
         self.endpoint.send([frame])

@@ -229,10 +229,10 @@ def _motors(
 def _pacing(scenario: Scenario, options: EmulatorOptions, parts: Parts, settings: Settings) -> Pacing:
     if options.clock == "realtime":
         spin_ns = choose_spin_ns(parts.clock, scenario.period_ns, options.spin_s, measure=has_own_core(settings))
-        # Drives on a bus are told at once; the legs are measured, and a delay made, by whoever wakes for each command.
-        wakes = options.legs or options.delay_ns or options.motors
-        through = not wakes and parts.endpoint.link.stamp_receives()
-        return RealTime(parts, ticks=scenario.ticks, spin_ns=spin_ns, sleeps_through=through)
+        through = not options.motors and parts.endpoint.link.stamp_receives()  # drives on a bus are told at once
+        return RealTime(
+            parts, ticks=scenario.ticks, spin_ns=spin_ns, sleeps_through=through, added_delay_ns=options.delay_ns
+        )
     keeper = RateKeeper(parts.clock, round(scenario.period_ns / options.speed)) if options.speed else None
     if options.profile == "tolerant":
         return Tolerant(parts, ticks=scenario.ticks, delay_ns=scenario.delay_ns, keeper=keeper, wait_s=options.wait_s)
