@@ -14,7 +14,7 @@ from protocol.errors import RunFolderError
 
 COLOURS = ("#0b61a4", "#c2410c", "#3f7d20", "#7a4fa3", "#7a7a7a", "#b8860b")
 STYLES = ("-", "--", ":")
-_TICKS = (0.0, 0.5, 0.9, 0.99, 0.999, 0.9999)
+_TICKS = (0.5, 0.9, 0.99, 0.999, 0.9999)
 
 
 def draw(
@@ -30,8 +30,8 @@ def draw(
     left, right = figure.subplots(1, 2)
     for number, (name, values) in enumerate(curves.items()):
         ordered = np.sort(values) / 1e3
-        if not len(ordered):
-            continue
+        if not ordered.any():
+            continue  # nothing, or nothing but zeros, for which a logarithmic axis has no place
         share = (np.arange(len(ordered)) + 0.5) / len(ordered)
         style = {"color": COLOURS[number % len(COLOURS)], "linestyle": STYLES[number // len(COLOURS) % len(STYLES)]}
         left.plot(1.0 / (1.0 - share), ordered, linewidth=1.3, label=name, **style)
