@@ -109,7 +109,10 @@ class Link(abc.ABC):
         """A name for the other end, for messages: "127.0.0.1:43210", or NOBODY."""
 
     def stamp_receives(self) -> bool:
-        """Have `received_ns` told from now on; False where the transport or the system cannot."""
+        """Have `received_ns` told from now on; False where the transport or the system cannot.
+
+        Linux turns its stamps on a moment after it was asked to: until then the stamp is the time of the fetching.
+        """
         return False
 
     def counters(self) -> dict[str, int]:

@@ -73,9 +73,8 @@ class ParameterServer:
         if wanted.value is not None:
             refusal = self._parameters.set(index, wanted.kind, wanted.value, armed=self._is_armed())
         if refusal:
-            self._refuse(
-                wanted, asker, refusal
-            )  # first: a station that knows it need not take the old value for a miss
+            # First: a station that knows it need not take the old value for a miss.
+            self._refuse(wanted, asker, refusal)
         self._answers.append(self._parameters.saying(index))
         if not refusal and self._parameters.counters["parameters_set"] > before:
             self._on_change(index)
