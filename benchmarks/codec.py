@@ -69,7 +69,8 @@ def _calls(name: str) -> dict[str, tuple[Callable[[], object], Callable[[], obje
 
 
 def _arguments(message: Any) -> list[Any]:
-    return [getattr(message, field) for field in message.fieldnames]
+    """What the message's class takes: for texts the bytes, which pymavlink keeps beside what it made of them."""
+    return [getattr(message, f"_{field}_raw", getattr(message, field)) for field in message.fieldnames]
 
 
 def _microseconds(call: Callable[[], object]) -> float:
