@@ -6,6 +6,7 @@ from collections import deque
 
 from bridge.clock import Clock
 from bridge.link import Link
+from bridge.wrapped_link import WrappedLink
 from protocol.errors import LinkClosedError
 
 _SPIN_NS = 200_000
@@ -15,18 +16,15 @@ _FETCHED_AT_ONCE = 1000
 """A bound: a peer that floods the link must not keep `recv` from ending."""
 
 
-class DelayedLink(Link):
+class DelayedLink(WrappedLink):
     """A link whose receiving end gets everything later by a fixed wall time, in the order in which it came.
 
     The delay counts from the kernel's receive time where the link tells it, else from when the datagram was fetched. What
-    is counted (`stats`) is what the link itself received and sent.
+    is counted (`stats`) is what the link itself received and sent; a stamp is that of the arrival, before the delay.
     """
 
     def __init__(self, link: Link, delay_ns: int, clock: Clock) -> None:
-        super().__init__(link.uri)
-        self.is_datagram = link.is_datagram
-        self.stats = link.stats
-        self._link = link
+        super().__init__(link)
         self._clock = clock
         self._delay_ns = delay_ns
         self._held: deque[tuple[int, int, bytes]] = deque()
@@ -82,35 +80,8 @@ class DelayedLink(Link):
         self._held.append((came_ns + self._delay_ns, self._link.received_ns, data))
         return True
 
-    @property
-    def spin_s(self) -> float:
-        """The link's."""
-        return self._link.spin_s
-
-    @spin_s.setter
-    def spin_s(self, value: float) -> None:
-        self._link.spin_s = value
-
-    def send(self, data: bytes | bytearray | memoryview) -> None:
-        """Send at once."""
-        self._link.send(data)
-
-    def stamp_receives(self) -> bool:
-        """As the link does; a stamp is that of the arrival, before the delay."""
-        return self._link.stamp_receives()
-
-    def close(self) -> None:
-        """Close the link; what is on its way is lost."""
-        self._closed = True
-        self._link.close()
-
-    @property
-    def peer(self) -> str:
-        """The link's."""
-        return self._link.peer
-
     def release_peer(self) -> None:
         """As the link does; what the last peer's closing left, and what is on its way from it, are forgotten too."""
         self._held.clear()
         self._ended_by = None
-        self._link.release_peer()
+        super().release_peer()

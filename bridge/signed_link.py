@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from bridge.clock import MonotonicClock, unix_time_us
 from bridge.link import Link
+from bridge.wrapped_link import WrappedLink
 from protocol.mavlink_codec import FrameReader
 from protocol.signing import Signatures, Verdict, strip
 
 
-class SignedLink(Link):
+class SignedLink(WrappedLink):
     """A link with a key (32 bytes). Its peer is forgotten again where its first words are not believed.
 
     dropped   unsigned        frames without a signature
@@ -22,15 +23,12 @@ class SignedLink(Link):
     """
 
     def __init__(self, link: Link, key: bytes) -> None:
-        super().__init__(link.uri)
-        self.is_datagram = link.is_datagram
-        self._link = link
+        super().__init__(link)
         self._clock = MonotonicClock()
         self._signatures = Signatures(key)
         self._incoming = FrameReader(is_datagram=link.is_datagram, follow_sequence=False)
         self._outgoing = FrameReader(is_datagram=True, follow_sequence=False)
         self._is_believed = False
-        self.stats = link.stats
         self._dropped = dict.fromkeys(("unsigned", "bad_signature", "old_signature", "unsealed"), 0)
 
     def recv(self, timeout_s: float) -> bytes | None:
@@ -75,33 +73,10 @@ class SignedLink(Link):
         now_us = unix_time_us()
         self._link.send(b"".join(self._signatures.sign(one, now_us) for one in self._outgoing.read(bytes(data))))
 
-    @property
-    def spin_s(self) -> float:
-        """The link's."""
-        return self._link.spin_s
-
-    @spin_s.setter
-    def spin_s(self, value: float) -> None:
-        self._link.spin_s = value
-
-    def stamp_receives(self) -> bool:
-        """As the link does."""
-        return self._link.stamp_receives()
-
-    def close(self) -> None:
-        """Close the link."""
-        self._closed = True
-        self._link.close()
-
-    @property
-    def peer(self) -> str:
-        """The link's."""
-        return self._link.peer
-
     def release_peer(self) -> None:
         """As the link does; whoever comes next must be believed anew."""
         self._is_believed = False
-        self._link.release_peer()
+        super().release_peer()
 
 
 def signed(link: Link, key: bytes | None) -> Link:
