@@ -18,9 +18,9 @@ import can
 import numpy as np
 
 from benchmarks.row import row
-from bridge.can_bus import CanBus
+from bridge.motor_bus.can_bus import CanBus
 from protocol.can_frame import CanFrame
-from protocol.motor_protocol import PROTOCOLS, Cause, make_drive, make_host
+from protocol.motors.motor_protocol import PROTOCOLS, Cause, make_drive, make_host
 from protocol.scenario import Motor
 
 GROUP = "239.74.163.2"

@@ -15,7 +15,7 @@ import matplotlib
 import msgspec
 import numpy as np
 
-from bridge.can_load import plan_bus
+from bridge.motor_bus.can_load import plan_bus
 from fwav_hil.run import MotorsOnCan, RunFailedError, RunOptions, run
 from fwav_hil.run_folder import new_folder
 from fwav_hil.score import scores

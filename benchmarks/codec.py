@@ -10,8 +10,8 @@ from typing import Any
 from pymavlink.dialects.v20 import common
 
 from benchmarks.row import ALTERNATIONS, row
-from protocol.mavlink_codec import FrameReader, FrameWriter, layout
-from protocol.streams import STREAMS
+from protocol.wire.codec import FrameReader, FrameWriter, layout
+from protocol.wire.streams import STREAMS
 
 BATCHES, CALLS = 12, 300
 """Short batches, ours and theirs by turns, so that a noisy moment meets both; the best batch counts."""

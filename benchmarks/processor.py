@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.row import ALTERNATIONS, row
-from bridge.clock import MonotonicClock
-from bridge.wake_up import try_wake_ups
+from bridge.timing.clock import MonotonicClock
+from bridge.timing.wake_up import try_wake_ups
 
 RATE_HZ, SECONDS = 1000, 5
 BAR = 0.15

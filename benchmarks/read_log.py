@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.row import ALTERNATIONS, row
-from protocol.log_dialect import layouts_by_name
-from protocol.log_scan import scan_tlog
-from protocol.log_tables import tables
-from protocol.mavlink_codec import FrameWriter
+from protocol.logs.dialect import layouts_by_name
+from protocol.logs.scan import scan_tlog
+from protocol.logs.tables import tables
+from protocol.wire.codec import FrameWriter
 
 # What a vehicle's telemetry is made of, by how often it comes.
 MIX = {
@@ -31,8 +31,8 @@ _DAY_US = 1_700_000_000_000_000
 _MEMORY = """
 import resource, sys
 from pathlib import Path
-from protocol.log_scan import scan_tlog
-from protocol.log_tables import tables
+from protocol.logs.scan import scan_tlog
+from protocol.logs.tables import tables
 peak = lambda: 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 path = Path(sys.argv[1])
 tables(scan_tlog(path.open("rb").read(5000)))

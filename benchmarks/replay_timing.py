@@ -17,8 +17,8 @@ import numpy as np
 
 from benchmarks.row import ALTERNATIONS, row
 from benchmarks.wake_up import cyclictest
-from bridge.realtime import own_core
-from protocol.mavlink_codec import FrameWriter, layout
+from bridge.timing.realtime import own_core
+from protocol.wire.codec import FrameWriter, layout
 
 RATE_HZ, SECONDS = 250.0, 4.0
 BAR_US, BAR_SPEED = 1000.0, 0.005

@@ -9,9 +9,9 @@ import sys
 from typing import Any
 
 from benchmarks.row import ALTERNATIONS, row
-from bridge.clock import MonotonicClock
-from bridge.realtime import PRIORITY, own_core
-from bridge.wake_up import try_wake_ups
+from bridge.timing.clock import MonotonicClock
+from bridge.timing.realtime import PRIORITY, own_core
+from bridge.timing.wake_up import try_wake_ups
 
 RATE_HZ = 1000.0
 MISSED_US = 1000

@@ -12,8 +12,9 @@ from typing import Any, ClassVar, TypeVar
 import click
 
 from bridge.option_types import FiniteRange
-from bridge.process import Report, StopFlag, end_with_parent, report_json, sit_on_core
-from protocol.errors import FwavHilError, Interrupted, RunFolderError
+from bridge.process import StopFlag, end_with_parent, sit_on_core
+from bridge.reporting import Report, report_json
+from protocol.errors import FwavHilError, Interrupted, RunFolderError, UsageError
 from protocol.scenario import Scenario, find_scenario, load_scenario, with_overrides
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -129,7 +130,7 @@ def signing_key_of(path: Path | None) -> bytes | None:
     """The key in a file, or None where none is named. Raises UsageError."""
     if path is None:
         return None
-    from protocol.retime import read_key
+    from protocol.logs.retime import read_key
 
     return read_key(path)
 
@@ -137,6 +138,16 @@ def signing_key_of(path: Path | None) -> bytes | None:
 def chosen_scenario(name: str, **overrides: Any) -> Scenario:
     """The scenario of a name or path, with what the command line changes. Raises ScenarioError."""
     return with_overrides(load_scenario(find_scenario(name)), **overrides)
+
+
+def refuse_rate_that_cannot_fit(uri: str, rate_hz: float) -> None:
+    """Raise UsageError where a serial line cannot carry the contract at a rate; other links are not looked at."""
+    if uri.startswith("serial://"):
+        from bridge.latency.budget import link_budget
+
+        budget = link_budget(uri, rate_hz)
+        if not budget.fits:
+            raise UsageError(budget.sentence)
 
 
 def begin_process(status: str, core: int | None, *, with_parent: bool) -> tuple[Report, StopFlag]:

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from bridge.link import Link
+from bridge.links.link import Link
 from protocol.errors import ScenarioMismatchError
-from protocol.mavlink_codec import Frame, FrameReader, FrameWriter, Layout
-
-VEHICLE = (1, 1)
-"""(system, component) of the controller, as of any autopilot."""
+from protocol.wire.codec import Frame, FrameReader, FrameWriter, Layout
 
 
 class Endpoint:

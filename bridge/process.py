@@ -6,19 +6,11 @@ import ctypes
 import os
 import signal
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TextIO
 
-import msgspec
-
-from bridge.clock import MonotonicClock
-from bridge.link import Link, open_link
+from bridge.links.link import Link, open_link
+from bridge.timing.clock import MonotonicClock
 from protocol.errors import Interrupted, PeerMissingError, RunFolderError
-
-Report = Callable[[dict[str, Any]], None]
-"""Takes one event of a process: a dictionary with the key "event"."""
-
 
 _CONNECT_SLICE_S = 0.2
 
@@ -89,13 +81,3 @@ def sit_on_core(core: int) -> None:
             os.sched_setaffinity(0, {core})
         except (OSError, ValueError, OverflowError):
             return
-
-
-def report_json(stream: TextIO) -> Report:
-    """A report that writes one JSON object a line, for a parent process to read."""
-
-    def report(event: dict[str, Any]) -> None:
-        stream.write(msgspec.json.encode(event).decode() + "\n")
-        stream.flush()
-
-    return report

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 
-from protocol import mavlink_map, requests
-from protocol.mavlink_codec import Frame, Layout
-from protocol.requests import Request, Result
-from protocol.streams import Due
+from protocol.wire import mapping, requests
+from protocol.wire.codec import Frame, Layout
+from protocol.wire.requests import Request, Result
+from protocol.wire.streams import Due
 
 Handler = Callable[[Request], Result]
 """Obeys a request, or says why not."""
@@ -49,7 +49,7 @@ class Requests:
 
     def take(self, frame: Frame) -> bool:
         """Obey or refuse a COMMAND_LONG; whether it was one for this component."""
-        if frame.message_id != mavlink_map.COMMAND_LONG.message_id:
+        if frame.message_id != mapping.COMMAND_LONG.message_id:
             return False
         request = requests.decode_request(frame.payload)
         if not request.is_for(self._who):
@@ -59,7 +59,7 @@ class Requests:
         self.counters["requests"] += 1
         self.counters["requests_refused"] += result is not Result.ACCEPTED
         payload = requests.encode_acknowledgement(request.command, result, (frame.system, frame.component))
-        self.reply(mavlink_map.COMMAND_ACK, payload)
+        self.reply(mapping.COMMAND_ACK, payload)
         return True
 
     def reply(self, message: Layout, payload: bytes) -> None:

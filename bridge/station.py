@@ -9,15 +9,15 @@ import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from bridge.clock import Clock, MonotonicClock
-from bridge.link import Link
+from bridge.links.link import Link
 from bridge.process import StopFlag, open_patiently
 from bridge.summary import make_folder
-from protocol import mavlink_map
+from bridge.timing.clock import Clock, MonotonicClock
 from protocol.errors import LinkError
-from protocol.mavlink_codec import Frame, FrameReader, FrameWriter, Layout
-from protocol.streams import Due, stream
-from protocol.tlog import TlogWriter
+from protocol.logs.tlog import TlogWriter
+from protocol.wire import mapping
+from protocol.wire.codec import Frame, FrameReader, FrameWriter, Layout
+from protocol.wire.streams import Due, stream
 
 POLL_HZ = 50.0
 """How often an end of the loop looks at its station's link, in simulation time."""
@@ -81,7 +81,7 @@ class Station:
         frames: list[Frame] = []
         try:
             if self._due.at(self._clock.now_ns()):
-                self.say(mavlink_map.HEARTBEAT, self._heartbeat())
+                self.say(mapping.HEARTBEAT, self._heartbeat())
             for _ in range(_MOST_AT_ONCE):
                 data = self._link.recv(0.0)
                 if not data:

@@ -18,6 +18,7 @@ from bridge.command_line import (
     process_options,
     rate_option,
     realtime_option,
+    refuse_rate_that_cannot_fit,
     scenario_argument,
     signing_key_of,
     signing_option,
@@ -26,9 +27,8 @@ from bridge.command_line import (
     trigger_option,
     wait_option,
 )
-from bridge.link import refuse_rate_that_cannot_fit
-from bridge.realtime import check_real_time, own_core
 from bridge.summary import show_json
+from bridge.timing.realtime import check_real_time, own_core
 
 EXAMPLE = """
 \b
@@ -90,7 +90,8 @@ def controller(
     if clock == "realtime":
         refuse_rate_that_cannot_fit(link, chosen.rate_hz)
     report, stop = begin_process(status, core, with_parent=with_parent)
-    from controller.process import ControllerOptions, run_controller
+    from controller.options import ControllerOptions
+    from controller.process import run_controller
 
     run_options = ControllerOptions(
         link=link, clock=clock, arm=arm, out=out, wait_s=wait_s, spin_s=None if spin_us is None else spin_us * 1e-6,

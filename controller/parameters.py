@@ -13,11 +13,11 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from controller.laws import LAWS
+from controller.laws.registry import LAWS
 from protocol.errors import FwavHilError
-from protocol.mavlink_codec import Layout
-from protocol.parameter_map import VALUE, Kind, Refusal, encode_value
 from protocol.scenario import Scenario, with_overrides
+from protocol.wire.codec import Layout
+from protocol.wire.parameter_mapping import VALUE, Kind, Refusal, encode_value
 
 AXIS_NAMES = ("X", "Y", "Z", "ROLL", "PITCH", "YAW")
 

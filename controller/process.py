@@ -6,39 +6,39 @@ import functools
 import sys
 from collections import deque
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
-from bridge.clock import Clock, MonotonicClock, processor_time_ns
-from bridge.endpoint import VEHICLE, Endpoint
-from bridge.legs import CONTROLLER_FILE, SAMPLE_COLUMNS, LegTable, save_legs
-from bridge.link import Link
-from bridge.memory import memory_pair
-from bridge.process import Report, StopFlag, open_patiently, take_folder
-from bridge.rate import RateKeeper, choose_spin_ns
-from bridge.realtime import has_own_core, maybe_real_time, report_settings
+from bridge.endpoint import Endpoint
+from bridge.latency.segments import CONTROLLER_FILE, SAMPLE_COLUMNS, LegTable, save_legs
+from bridge.links.link import Link
+from bridge.links.memory import memory_pair
+from bridge.links.signed_link import signed
+from bridge.process import StopFlag, open_patiently, take_folder
+from bridge.reporting import Report
 from bridge.requests import NEVER
-from bridge.signed_link import signed
 from bridge.station import Station, open_station
 from bridge.summary import write_json
-from bridge.timesync import TimeSync
-from controller.actuation import HilActuation
-from controller.ground_station import GroundStation
-from controller.law import Law
-from controller.laws import make_law, refuse_on_a_link
+from bridge.timing.clock import Clock, MonotonicClock, processor_time_ns
+from bridge.timing.rate import RateKeeper, choose_spin_ns
+from bridge.timing.realtime import has_own_core, maybe_real_time, report_settings
+from bridge.timing.timesync import TimeSync
+from controller.laws.law import Law, make_law
+from controller.laws.registry import refuse_on_a_link
+from controller.options import ControllerOptions
 from controller.parameters import Parameters
 from controller.quick import QuickAnswers
-from controller.telemetry import HilTelemetry
+from controller.sinks.hil import HilActuation
+from controller.sources.hil import HilTelemetry
+from controller.station.ground_station import GroundStation
 from controller.vehicle import Vehicle
-from protocol import mavlink_map
 from protocol.errors import FwavHilError, Interrupted, LinkClosedError, PeerLostError, PeerMissingError, UsageError
-from protocol.messages import ActuatorCommand, PositionSample
+from protocol.messages import VEHICLE, ActuatorCommand, PositionSample
 from protocol.scenario import Scenario
-from protocol.streams import HEARTBEAT_TIMEOUT_NS, Due
-from protocol.tick_frames import CommandWriter
+from protocol.wire import mapping
+from protocol.wire.streams import HEARTBEAT_TIMEOUT_NS, Due
+from protocol.wire.tick_frames import CommandWriter
 
 RESULT = "controller.json"
 STATION_FILE = "station_controller.tlog"
@@ -46,30 +46,6 @@ HELLO_PERIOD_S = 0.1
 LOOK_PERIOD_S = 0.1
 PATIENCE_PERIODS = 1.5
 """In real time a sample that is this late counts as missing: the last command is then given again."""
-
-
-class ControllerOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How the process runs.
-
-    link: a URI, or `-` to read it from standard input once everything is ready. legs: real time: note when each sample
-    and command was where. trigger: in real time, `sample` or `clock`. realtime, core: ask for what `bridge.realtime` lists.
-    spin_s: in lockstep see `Link.spin_s` (None: 0); in real time how long to poll before a sample or deadline is due (None:
-    as measured with `realtime`, else 0). station: URI of a ground station's link. key: of
-    signatures on the loop's link.
-    """
-
-    link: str
-    clock: str = "lockstep"
-    arm: bool = True
-    out: Path | None = None
-    wait_s: float = 30.0
-    spin_s: float | None = None
-    legs: bool = False
-    trigger: str = "sample"
-    realtime: bool = False
-    core: int | None = None
-    station: str | None = None
-    key: bytes | None = None
 
 
 class Controller:
@@ -121,7 +97,7 @@ class Controller:
         self._samples: deque[PositionSample] = deque()
         self._silence_ns = 0
         self._begun = self._was_armed = False
-        self.time_sync = TimeSync(self.endpoint, clock)
+        self.time_sync = TimeSync(self.endpoint.seal, clock)
         self.legs = LegTable(SAMPLE_COLUMNS) if options.legs else None
         self._woke_ns = 0
         self._came_ns = (0, 0)
@@ -278,7 +254,7 @@ class Controller:
                         self.endpoint.reader.restart_sequences([(frame.system, frame.component, frame.sequence + 1)])
                     self._samples.append(sample)
                     self._note_arrival()
-            elif frame.message_id == mavlink_map.TIMESYNC.message_id and not self._lockstep:
+            elif frame.message_id == mapping.TIMESYNC.message_id and not self._lockstep:
                 answer = self.time_sync.take(frame, self.endpoint.link.received_ns or self._woke_ns)
                 if answer:
                     self.endpoint.send([answer])
@@ -339,8 +315,8 @@ class Controller:
 
 def warm_up(law: Law) -> None:
     """Have every kernel of the loop compiled (or loaded) before the emulator waits for an answer."""
-    mavlink_map.decode_pose(mavlink_map.encode_pose(0, np.zeros(6)))
-    mavlink_map.encode_attitude_target(0, np.zeros(6))
+    mapping.decode_pose(mapping.encode_pose(0, np.zeros(6)))
+    mapping.encode_attitude_target(0, np.zeros(6))
     state = law.start()
     command = ActuatorCommand(0, law.step(state, 0, np.zeros(6)), armed=True)
     near, far = memory_pair()
@@ -395,7 +371,7 @@ def serve(
     error: FwavHilError | None = None
     with (
         open_station(
-            options.station, VEHICLE, lambda: mavlink_map.encode_controller_heartbeat(armed=controller.vehicle.armed),
+            options.station, VEHICLE, lambda: mapping.encode_controller_heartbeat(armed=controller.vehicle.armed),
             options.out / STATION_FILE if options.out else None, options.wait_s, stop,
         ) as station,
         maybe_real_time(options.core, wanted=options.realtime) as settings,

@@ -1,7 +1,7 @@
 """The controller's part of a tick in one compiled call: read the sample, step the law, write the command.
 
-The kernels are those that everything else is made of (`law`, `protocol.tick_frames`), called one after the other without the
-way through Python. It takes the plain case only, a pose and its tick that are next in line and nothing beside them; for all
+The kernels are those that everything else is made of (`law`, `protocol.wire.tick_frames`), called one after the other without
+the way through Python. It takes the plain case only, a pose and its tick that are next in line and nothing beside them; for all
 else it changes nothing and says so, and the caller goes the long way.
 """
 
@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from bridge.endpoint import VEHICLE, Endpoint
-from controller.law import Law, LawState, packed_control_step
+from bridge.endpoint import Endpoint
+from controller.laws.law import Law, LawState, packed_control_step
 from protocol.compiled import Packed, compiled
-from protocol.frame_kernels import Bytes
-from protocol.messages import FloatArray
-from protocol.tick_frames import CommandWriter, parse_tick, write_command
+from protocol.messages import VEHICLE, FloatArray
+from protocol.wire.framing import Bytes
+from protocol.wire.tick_frames import CommandWriter, parse_tick, write_command
 
 NOT_PLAIN = -1
 

@@ -10,16 +10,17 @@ from collections import deque
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from bridge.endpoint import VEHICLE, Endpoint, refuse_other_scenario
+from bridge.endpoint import Endpoint, refuse_other_scenario
 from bridge.requests import Handler, Requests, Saying
 from controller.parameters import Parameters
-from protocol import mavlink_map
-from protocol.mavlink_codec import Frame
-from protocol.requests import ARM_DISARM, Request, Result, wanted_arming
-from protocol.streams import Due, stream
+from protocol.messages import VEHICLE
+from protocol.wire import mapping
+from protocol.wire.codec import Frame
+from protocol.wire.requests import ARM_DISARM, Request, Result, wanted_arming
+from protocol.wire.streams import Due, stream
 
 OFFERED: Mapping[int, float | None] = MappingProxyType(
-    {mavlink_map.HEARTBEAT.message_id: None, mavlink_map.VERSION.message_id: None}
+    {mapping.HEARTBEAT.message_id: None, mapping.VERSION.message_id: None}
 )
 """Messages that are sent on request."""
 PARAMETERS_HZ = 50.0
@@ -84,12 +85,12 @@ class Vehicle:
             return
         if (frame.system, frame.component) != self._emulator:
             return
-        if frame.message_id == mavlink_map.VERSION.message_id:
-            refuse_other_scenario("emulator", mavlink_map.decode_version(frame.payload), self._digest)
+        if frame.message_id == mapping.VERSION.message_id:
+            refuse_other_scenario("emulator", mapping.decode_version(frame.payload), self._digest)
             if not self.agreed and self._arm_at_start:
                 self.armed = True
             self.agreed = True
-        elif frame.message_id == mavlink_map.HEARTBEAT.message_id and mavlink_map.heartbeat_is_ending(frame.payload):
+        elif frame.message_id == mapping.HEARTBEAT.message_id and mapping.heartbeat_is_ending(frame.payload):
             self.ended = True
 
     def say_parameter(self, index: int) -> None:
@@ -119,11 +120,11 @@ class Vehicle:
         return [self._parameters.saying(index) for index in indices]
 
     def _heartbeat_saying(self) -> Saying:
-        return mavlink_map.HEARTBEAT, mavlink_map.encode_controller_heartbeat(armed=self.armed)
+        return mapping.HEARTBEAT, mapping.encode_controller_heartbeat(armed=self.armed)
 
     def _version_saying(self) -> Saying:
-        return mavlink_map.VERSION, mavlink_map.encode_version(self._digest, has_parameters=True)
+        return mapping.VERSION, mapping.encode_version(self._digest, has_parameters=True)
 
     def on_request(self, number: int, _t_ns: int) -> list[Saying]:
         """The message of an id that is `offered`."""
-        return [self._version_saying() if number == mavlink_map.VERSION.message_id else self._heartbeat_saying()]
+        return [self._version_saying() if number == mapping.VERSION.message_id else self._heartbeat_saying()]

@@ -12,7 +12,7 @@ from bridge.summary import is_stdout, show_json
 from protocol.errors import UsageError
 
 if TYPE_CHECKING:
-    from bridge.budget import Budget
+    from bridge.latency.budget import Budget
 
 
 @click.command("budget", epilog="\b\nExample:\n  fwav-hil budget --link serial:///dev/ttyUSB0:921600 --rate 500")
@@ -33,7 +33,7 @@ def budget(scenario: str, link: str, rate: float | None, json_path: Path | None)
     Exit code: 0 where the rate fits, else 2.
     """
     chosen = chosen_scenario(scenario, rate_hz=rate)
-    from bridge.budget import link_budget
+    from bridge.latency.budget import link_budget
 
     found = link_budget(link, chosen.rate_hz)
     planned_s = chosen.delay_ns * 1e-9

@@ -9,8 +9,8 @@ import numpy as np
 from fwav_hil.plots import gear_panels
 from protocol.can_frame import CanFrame
 from protocol.messages import FloatArray
-from protocol.motor_lockstep import decode_encoders
-from protocol.motor_protocol import DRIVES
+from protocol.motors.motor_protocol import DRIVES
+from protocol.motors.simulation_sync import decode_encoders
 from protocol.scenario import Scenario
 
 

@@ -37,7 +37,7 @@ from bridge.command_line import (
 from bridge.option_types import check_speed, speed_option
 from bridge.summary import is_stdout, show_json
 from fwav_hil import __version__
-from plant_emulator.motor_options import chosen_motor_scenario, run_motor_options
+from plant_emulator.drives.motor_options import chosen_motor_scenario, run_motor_options
 
 COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
@@ -46,7 +46,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "emulator": ("plant_emulator.command:emulator", "Run the plant emulator alone."),
         "controller": ("controller.command:controller", "Run the controller alone."),
         "latency": ("fwav_hil.latency.command:latency", "Measure where the time goes in the loop or on a link."),
-        "motor": ("plant_emulator.motor_command:motor", "Be six simulated drives on a CAN bus."),
+        "motor": ("plant_emulator.drives.motor_command:motor", "Be six simulated drives on a CAN bus."),
         "paper": ("fwav_hil.studies.paper_command:paper_command", "Run the source paper's section IV again."),
         "margin": ("fwav_hil.studies.margin_command:margin_command", "Say whether the gains stand the link."),
         "design": ("fwav_hil.studies.design_command:design_command", "Search gains for a link."),
@@ -182,9 +182,9 @@ def run_command(
     chosen = chosen_motor_scenario(
         scenario, protocol=protocol, lag_s=lag, rate_hz=rate, duration_s=duration, seed=seed, law=law
     )
-    from bridge.link import refuse_rate_that_cannot_fit
-    from bridge.realtime import check_real_time
-    from controller.laws import refuse_on_a_link
+    from bridge.command_line import refuse_rate_that_cannot_fit
+    from bridge.timing.realtime import check_real_time
+    from controller.laws.registry import refuse_on_a_link
     from fwav_hil.compile import compile_kernels
     from fwav_hil.run import MotorsOnCan, RunOptions, check_link, run
     from fwav_hil.run_folder import new_folder
@@ -254,7 +254,7 @@ def simulate_command(
     """Fly SCENARIO in this process: the same laws, plant, sampling, delays and noise, compiled, without a link."""
     chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
     from fwav_hil.run_folder import new_folder
-    from fwav_hil.simulated import simulate_run, simulate_spread
+    from fwav_hil.simulation_results import simulate_run, simulate_spread
     from fwav_hil.tables import print_spread, print_summary
     from protocol.errors import DivergenceError, UsageError
 
@@ -301,7 +301,7 @@ def _finish(folder: Path, json_path: Path | None, *, plots: bool) -> None:
         return
     if plots:
         from fwav_hil.plots import plot_run
-        from plant_emulator.truth import load_truth
+        from plant_emulator.plant.truth import load_truth
         from protocol.scenario import load_scenario
 
         scenario = load_scenario(folder / FILES["scenario"])

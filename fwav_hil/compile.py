@@ -15,7 +15,7 @@ def compile_kernels(scenario: Scenario) -> None:
     click.echo("compiling the kernels (once after each installation, some ten seconds) ...", err=True)
     import controller.process
     import plant_emulator.process
-    from controller.laws import make_law
+    from controller.laws.law import make_law
 
     plant_emulator.process.warm_up(scenario)
     controller.process.warm_up(make_law(scenario.law, scenario))

@@ -12,9 +12,9 @@ from bridge.option_types import FiniteRange
 from bridge.summary import is_stdout, show_json
 
 if TYPE_CHECKING:
-    from bridge.machine import Finding
-    from bridge.realtime import Settings
-    from bridge.wake_up import Trial
+    from bridge.timing.machine import Finding
+    from bridge.timing.realtime import Settings
+    from bridge.timing.wake_up import Trial
 
 RATES_HZ = (250.0, 500.0, 1000.0)
 UNKEPT_EXIT_CODE = 1
@@ -42,10 +42,10 @@ def doctor(seconds: float, rates_hz: tuple[float, ...], json_path: Path | None) 
     \b
     Exit code: 0 where every rate is kept with --realtime, else 1.
     """
-    from bridge.clock import MonotonicClock
-    from bridge.machine import Machine
-    from bridge.realtime import own_core
-    from bridge.wake_up import try_wake_ups
+    from bridge.timing.clock import MonotonicClock
+    from bridge.timing.machine import Machine
+    from bridge.timing.realtime import own_core
+    from bridge.timing.wake_up import try_wake_ups
 
     findings = Machine().findings()
     trials: list[Trial] = []

@@ -53,4 +53,4 @@ class MotorKeeper:
         )
 
     def _start(self) -> Child:
-        return Child("plant_emulator.motor_command", self._arguments, name="motor")
+        return Child("plant_emulator.drives.motor_command", self._arguments, name="motor")

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
-from bridge.clock import MonotonicClock
+from bridge.timing.clock import MonotonicClock
 
 _LINE_PERIOD_NS = 2_000_000_000
 

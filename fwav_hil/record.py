@@ -9,14 +9,14 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from bridge.clock import MonotonicClock, unix_time_us
-from bridge.link import NOBODY, Link
+from bridge.links.link import NOBODY, Link
 from bridge.process import StopFlag, open_patiently
-from bridge.recorder import Recorder, refuse_existing_log
-from bridge.sidecar import LinkOfLog
-from bridge.sidecar_log import Tell
+from bridge.recording.recorder import Tell
+from bridge.recording.sidecar import LinkOfLog
+from bridge.recording.thread_recorder import Recorder, refuse_existing_log
+from bridge.timing.clock import MonotonicClock, unix_time_us
 from fwav_hil.progress import StatusLine
-from protocol.mavlink_codec import FrameReader, layouts_by_id
+from protocol.wire.codec import FrameReader, layouts_by_id
 
 LOOK_PERIOD_S = 0.1
 _RATE_PERIOD_S = 0.5

@@ -48,8 +48,8 @@ def record_command(
     Nothing is sent. Frames of unknown messages and of MAVLink 1 are kept. Ctrl-C ends the recording (exit code 0). Exit code
     4: nothing came.
     """
-    from bridge.clock import local_stamp
     from bridge.process import StopFlag
+    from bridge.timing.clock import local_stamp
     from fwav_hil.record import record
     from protocol.errors import PeerMissingError
 

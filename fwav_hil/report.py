@@ -12,7 +12,7 @@ from bridge.summary import read_json, write_json
 from fwav_hil import __version__
 from fwav_hil.run_folder import FILES
 from fwav_hil.score import scores
-from plant_emulator.truth import load_truth
+from plant_emulator.plant.truth import load_truth
 from protocol.scenario import NANOSECONDS, Scenario, load_scenario
 
 _DROPPED = (

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import msgspec
 
-from bridge.link import parse_link_uri
+from bridge.links.link import parse_link_uri
 from bridge.process import StopFlag
 from fwav_hil.children import Child, listen
 from fwav_hil.motor_child import MotorKeeper
@@ -98,15 +98,15 @@ def check_motors(scenario: Scenario, motors: MotorsOnCan) -> None:
 
     Before anything is started, so that no folder is left behind.
     """
-    from bridge.can_bus import parse_can_uri
-    from bridge.can_load import plan_bus
+    from bridge.motor_bus.can_bus import parse_can_uri
+    from bridge.motor_bus.can_load import plan_bus
 
     parse_can_uri(motors.can)
     plan_bus(scenario.motor.protocol, scenario.motor, scenario.rate_hz)
     if motors.tap:
         parse_link_uri(motors.tap)
     if motors.log:
-        from plant_emulator.can_recorder import check_record
+        from plant_emulator.drives.can_recorder import check_record
 
         check_record(motors.log)
 
@@ -232,7 +232,7 @@ def _error_now(scenario: Scenario, t_ns: int, q: list[float]) -> tuple[float, fl
     """Largest position error (m) and attitude error (rad) at one time."""
     import numpy as np
 
-    from controller.reference import evaluate_reference, reference_parameters
+    from controller.laws.reference import evaluate_reference, reference_parameters
 
     desired = np.empty((3, 6))
     evaluate_reference(t_ns * 1e-9, reference_parameters(scenario.reference), desired[0], desired[1], desired[2])

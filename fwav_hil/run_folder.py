@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-from bridge.clock import local_stamp
 from bridge.summary import make_folder, refuse_existing_run, write_text
+from bridge.timing.clock import local_stamp
 from protocol.scenario import Scenario
 
 FILES: Mapping[str, str] = MappingProxyType(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from controller.reference import reference_trajectory
+from controller.laws.reference import reference_trajectory
 from protocol.messages import AXES, FloatArray
 from protocol.scenario import NANOSECONDS, Scenario
 

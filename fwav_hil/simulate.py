@@ -10,9 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from controller.law import Law, control_step
-from controller.laws import make_law
-from plant_emulator.integrate import (
+from controller.laws.law import Law, control_step, make_law
+from plant_emulator.plant.integrate import (
     GOES_ON,
     TOO_MANY_PENDING,
     Plant,
@@ -21,13 +20,13 @@ from plant_emulator.integrate import (
     divergence_sentence,
     push_command,
 )
-from plant_emulator.safety import clamp
-from plant_emulator.sensors import PositionSensor, add_noise
+from plant_emulator.plant.safety import clamp
+from plant_emulator.plant.sensors import PositionSensor, add_noise
 from protocol.compiled import Packed, compiled
 from protocol.errors import UsageError
-from protocol.mavlink_map import pose_from_wire, pose_to_wire
 from protocol.messages import FloatArray
 from protocol.scenario import Scenario
+from protocol.wire.mapping import pose_from_wire, pose_to_wire
 
 
 @compiled

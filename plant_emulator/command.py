@@ -19,6 +19,7 @@ from bridge.command_line import (
     process_options,
     rate_option,
     realtime_option,
+    refuse_rate_that_cannot_fit,
     scenario_argument,
     seed_option,
     signing_key_of,
@@ -28,11 +29,10 @@ from bridge.command_line import (
     truth_option,
     wait_option,
 )
-from bridge.link import refuse_rate_that_cannot_fit
 from bridge.option_types import check_speed, speed_option
-from bridge.realtime import check_real_time, own_core
 from bridge.summary import show_json
-from plant_emulator.motor_options import chosen_motor_scenario, run_motor_options
+from bridge.timing.realtime import check_real_time, own_core
+from plant_emulator.drives.motor_options import chosen_motor_scenario, run_motor_options
 
 EXAMPLE = """
 \b
@@ -112,7 +112,8 @@ def emulator(
     if clock == "realtime" or speed:
         refuse_rate_that_cannot_fit(link, chosen.rate_hz * (1.0 if clock == "realtime" else speed or 1.0))
     report, stop = begin_process(status, core, with_parent=with_parent)
-    from plant_emulator.process import EmulatorOptions, MotorLink, run_emulator
+    from plant_emulator.options import EmulatorOptions, MotorLink
+    from plant_emulator.process import run_emulator
 
     motors = MotorLink(can=can, feedback=feedback, log=can_log, tap=tap) if motor == "can" else None
     run_options = EmulatorOptions(

@@ -11,21 +11,21 @@ import numpy as np
 
 from bridge.endpoint import Endpoint
 from bridge.station import Station
-from plant_emulator.integrate import Plant
 from plant_emulator.on_request import OnRequest
+from plant_emulator.plant.integrate import Plant
+from plant_emulator.plant.safety import SafetyEnvelope
+from plant_emulator.plant.sensors import InertialSensors
+from plant_emulator.plant.truth import TruthWriter
 from plant_emulator.quick import QuickTicks
-from plant_emulator.safety import SafetyEnvelope
-from plant_emulator.sensors import InertialSensors
-from plant_emulator.truth import TruthWriter
-from protocol import mavlink_map
 from protocol.errors import DivergenceError
-from protocol.mavlink_codec import Frame
 from protocol.messages import ActuatorCommand, FloatArray
 from protocol.scenario import Scenario
-from protocol.streams import Due, stream
+from protocol.wire import mapping
+from protocol.wire.codec import Frame
+from protocol.wire.streams import Due, stream
 
 if TYPE_CHECKING:  # what a run without a CAN bus need not load
-    from plant_emulator.can_motors import CanMotors
+    from plant_emulator.drives.can_motors import CanMotors
 
 
 class Emulator:
@@ -64,10 +64,10 @@ class Emulator:
         state, seal = self.plant.state, self._endpoint.seal
         frames = []
         if self._heartbeat.at(t_ns):
-            frames.append(seal(mavlink_map.HEARTBEAT, mavlink_map.encode_emulator_heartbeat()))
+            frames.append(seal(mapping.HEARTBEAT, mapping.encode_emulator_heartbeat()))
         if self._gps.at(t_ns):
             place = self._inertial.geodetic(state.motion)
-            frames.append(seal(mavlink_map.GPS, mavlink_map.encode_gps(t_ns, *place, state.motion[6:9])))
+            frames.append(seal(mapping.GPS, mapping.encode_gps(t_ns, *place, state.motion[6:9])))
         frames += [seal(*saying) for saying in self.on_request.due(t_ns)]
         frames.extend(self._quick.frames(t_ns))
         self._quiet_until_ns = min(self._heartbeat.next_ns, self._gps.next_ns, self.on_request.next_ns)
@@ -82,7 +82,7 @@ class Emulator:
 
     def decode(self, payload: bytes) -> ActuatorCommand | None:
         """The command in a HIL_ACTUATOR_CONTROLS; None, counted, where a control is not a number."""
-        command = mavlink_map.decode_command(payload, self._scale)
+        command = mapping.decode_command(payload, self._scale)
         if command is None:
             self.counters["refused_commands"] += 1
         return command

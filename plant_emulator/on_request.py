@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bridge.endpoint import VEHICLE
 from bridge.requests import Requests, Saying
 from bridge.station import POLL_HZ, Station
-from plant_emulator.integrate import Plant
-from plant_emulator.rigid_body import body_rates
-from plant_emulator.sensors import InertialSensors
-from protocol.mavlink_codec import Frame
+from plant_emulator.plant.integrate import Plant
+from plant_emulator.plant.rigid_body import body_rates
+from plant_emulator.plant.sensors import InertialSensors
+from protocol.messages import VEHICLE
 from protocol.scenario import Scenario
-from protocol.streams import Due
-from protocol.truth_map import ODOMETRY, RPM, STATE, encode_odometry, encode_rpm, encode_state
+from protocol.wire.codec import Frame
+from protocol.wire.streams import Due
+from protocol.wire.truth_mapping import ODOMETRY, RPM, STATE, encode_odometry, encode_rpm, encode_state
 
 if TYPE_CHECKING:
-    from plant_emulator.can_motors import CanMotors
+    from plant_emulator.drives.can_motors import CanMotors
 
 RPM_HZ = 10.0
 """Of RAW_RPM to a ground station, unless it asks for another rate."""

@@ -7,87 +7,45 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 import numpy as np
 
-from bridge.clock import MonotonicClock, processor_time_ns
-from bridge.endpoint import VEHICLE, Endpoint, refuse_other_scenario
-from bridge.faults import DelayedLink
-from bridge.legs import ANSWER_COLUMNS, CLOCK_COLUMNS, EMULATOR_FILE, TICK_COLUMNS, LegTable, save_legs
-from bridge.link import Link
-from bridge.memory import memory_pair
-from bridge.process import Report, StopFlag, open_patiently
-from bridge.rate import RateKeeper, choose_spin_ns
-from bridge.realtime import Settings, has_own_core, maybe_real_time, report_settings
-from bridge.ring_recorder import RingRecorder
-from bridge.sidecar import LinkOfLog
-from bridge.signed_link import signed
+from bridge.endpoint import Endpoint
+from bridge.latency.segments import ANSWER_COLUMNS, CLOCK_COLUMNS, EMULATOR_FILE, TICK_COLUMNS, LegTable, save_legs
+from bridge.links.faults import DelayedLink
+from bridge.links.link import Link
+from bridge.links.memory import memory_pair
+from bridge.links.signed_link import signed
+from bridge.process import StopFlag, open_patiently
+from bridge.recording.ring_recorder import RingRecorder
+from bridge.recording.sidecar import LinkOfLog
+from bridge.reporting import Report
 from bridge.station import open_station
 from bridge.summary import make_folder, percentiles_us, refuse_existing_run, write_json, write_text
+from bridge.timing.clock import MonotonicClock, processor_time_ns
+from bridge.timing.rate import RateKeeper, choose_spin_ns
+from bridge.timing.realtime import Settings, has_own_core, maybe_real_time, report_settings
 from plant_emulator.emulator import Emulator
-from plant_emulator.on_request import OnRequest
-from plant_emulator.pacing import Lockstep, Pacing, Parts, RealTime
-from plant_emulator.tolerant import Tolerant, meet_autopilot
-from plant_emulator.truth import TruthWriter
-from protocol import mavlink_map
-from protocol.errors import FwavHilError, PeerMissingError, RunFolderError, UsageError
-from protocol.messages import ActuatorCommand
+from plant_emulator.options import EmulatorOptions
+from plant_emulator.pacing.lockstep import Lockstep
+from plant_emulator.pacing.meeting import meet_autopilot, meet_controller
+from plant_emulator.pacing.pacing import Pacing, Parts
+from plant_emulator.pacing.real_time import RealTime
+from plant_emulator.pacing.tolerant import Tolerant
+from plant_emulator.plant.truth import TruthWriter
+from protocol.errors import FwavHilError, RunFolderError, UsageError
+from protocol.logs.tlog import TlogWriter
+from protocol.messages import VEHICLE, ActuatorCommand
 from protocol.scenario import NANOSECONDS, Scenario
-from protocol.streams import Due
-from protocol.tlog import TlogWriter
+from protocol.wire import mapping
 
 if TYPE_CHECKING:
-    from plant_emulator.can_motors import CanMotors
+    from plant_emulator.drives.can_motors import CanMotors
 
 STATION_FILE = "station_emulator.tlog"
 HELLO_PERIOD_S = 0.1
 PROGRESS_PERIOD_NS = 100_000_000
 FAREWELLS = 3
 """Times the end is said, since a datagram may be lost."""
-
-
-class MotorLink(msgspec.Struct, frozen=True, kw_only=True):
-    """How the emulator reaches its drives.
-
-    can: URI of the bus. feedback: "sync" (every bit of u) or "bus" (the protocol's own status). log: where the bus is
-    recorded, by suffix; None: motor_bus.blf in the run folder, if there is one. tap: MAVLink link of the CAN tap.
-    """
-
-    can: str
-    feedback: str = "sync"
-    log: Path | None = None
-    tap: str | None = None
-
-
-class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How the process runs.
-
-    speed: lockstep paced to that multiple of real time (None: as fast as it goes). delay_ns: real time: what comes is taken
-    so much later. legs: real time: note when each tick and command was where. realtime: ask for what `bridge.realtime`
-    lists, with `core` as the core to have. spin_s: in lockstep see `Link.spin_s` (None: 0); in real time how long to poll
-    before each deadline (None: as measured with `realtime`, else 0).
-    on_log_error: what a disk that refuses means for the run: "stop", or "continue" with what can be recorded.
-    motors: where the drives are, if not in the plant itself. station: URI of a ground station's link. truth_hz: say the true
-    state on the link at this rate, as if its peer had asked for it. key: of signatures on
-    the loop's link. profile: of lockstep, "exact" or "tolerant".
-    """
-
-    link: str
-    clock: str = "lockstep"
-    speed: float | None = None
-    out: Path | None = None
-    wait_s: float = 30.0
-    spin_s: float | None = None
-    delay_ns: int = 0
-    legs: bool = False
-    on_log_error: str = "stop"
-    realtime: bool = False
-    core: int | None = None
-    motors: MotorLink | None = None
-    station: str | None = None
-    key: bytes | None = None
-    truth_hz: float | None = None
-    profile: str = "exact"
 
 
 def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
@@ -200,7 +158,7 @@ def warm_up(scenario: Scenario) -> None:
         emulator = Emulator(scenario, Endpoint(near, *VEHICLE), None)
         emulator.sense(0)
         command = ActuatorCommand(0, np.zeros(6), armed=True)
-        emulator.decode(mavlink_map.encode_command(command, np.ones(6), lockstep=True))
+        emulator.decode(mapping.encode_command(command, np.ones(6), lockstep=True))
         emulator.act(0, 0, command)
         emulator.advance(scenario.period_ns)
         emulator.go_on(b"", 0, 1, 0)
@@ -212,7 +170,7 @@ def _motors(
     """The drives behind a bus, where there is one: python-can is loaded only then."""
     if options.motors is None:
         return contextlib.nullcontext()
-    from plant_emulator.motor_setup import open_motors
+    from plant_emulator.drives.motor_setup import open_motors
 
     return open_motors(
         scenario,
@@ -239,58 +197,8 @@ def _pacing(scenario: Scenario, options: EmulatorOptions, parts: Parts, settings
     return Lockstep(parts, ticks=scenario.ticks, delay_ns=scenario.delay_ns, keeper=keeper)
 
 
-def meet_controller(
-    scenario: Scenario, wait_s: float, endpoint: Endpoint, stop: StopFlag, on_request: OnRequest | None = None
-) -> None:
-    """Hold the plant at t = 0 until a controller with the same scenario says it is armed. Raises PeerError, Interrupted."""
-    digest = scenario.digest()
-    agreed = heard = False
-    clock = MonotonicClock()
-    give_up_ns = clock.now_ns() + round(wait_s * NANOSECONDS)
-    due = Due(1.0 / HELLO_PERIOD_S)
-    while (now_ns := clock.now_ns()) < give_up_ns:
-        stop.check()
-        hello = [
-            endpoint.seal(mavlink_map.HEARTBEAT, mavlink_map.encode_emulator_heartbeat()),
-            endpoint.seal(mavlink_map.VERSION, mavlink_map.encode_version(digest)),
-        ]
-        if heard and due.at(now_ns):
-            endpoint.send(hello)
-        received = endpoint.receive(HELLO_PERIOD_S)
-        if on_request:
-            for frame in received:
-                on_request.take(frame)
-            if replies := on_request.replies():
-                endpoint.send(endpoint.seal(*reply) for reply in replies)
-        for frame in received:
-            if (frame.system, frame.component) != VEHICLE:
-                continue
-            if not heard:
-                endpoint.send(hello)
-            heard = True
-            if frame.message_id == mavlink_map.VERSION.message_id:
-                refuse_other_scenario("controller", mavlink_map.decode_version(frame.payload), digest)
-                agreed = True
-            elif (
-                frame.message_id == mavlink_map.HEARTBEAT.message_id
-                and agreed
-                and mavlink_map.heartbeat_is_armed(frame.payload)
-            ):
-                endpoint.writer.sequence = 0  # the numbers of the run, and so its log, begin with the first tick
-                return
-    uri = endpoint.link.uri
-    if heard:
-        raise PeerMissingError(
-            f"the controller at {endpoint.link.peer} did not arm within {wait_s:g} s: start it with --arm"
-        )
-    raise PeerMissingError(
-        f"no controller came to {uri} within {wait_s:g} s: start one with `fwav-hil controller "
-        f"SCENARIO --link {uri.replace('in://', 'out://', 1)}`, or wait longer with --wait"
-    )
-
-
 def _heartbeat() -> bytes:
-    return mavlink_map.encode_emulator_heartbeat()
+    return mapping.encode_emulator_heartbeat()
 
 
 def _run_ticks(
@@ -355,8 +263,8 @@ def _run_ticks(
 
 def _say_farewell(emulator: Emulator, pacing: Pacing, t_ns: int) -> None:
     """Tell the controller that the run is over, and log it once."""
-    payload = mavlink_map.encode_emulator_heartbeat(ending=True)
-    frames = [pacing.endpoint.seal(mavlink_map.HEARTBEAT, payload) for _ in range(FAREWELLS)]
+    payload = mapping.encode_emulator_heartbeat(ending=True)
+    frames = [pacing.endpoint.seal(mapping.HEARTBEAT, payload) for _ in range(FAREWELLS)]
     try:
         for frame in frames:
             pacing.endpoint.send([frame])

@@ -1,24 +1,23 @@
 """The emulator's part of a tick in one compiled call: read the answer, let it act, record, move on, measure, write.
 
-The kernels are those that everything else is made of (`safety`, `integrate`, `sensors`, `protocol.tick_frames`), called one
-after the other without the way through Python. What can wait until the next tick is on its way, waits (`settle`).
+The kernels are those that everything else is made of (`safety`, `integrate`, `sensors`, `protocol.wire.tick_frames`), called
+one after the other without the way through Python. What can wait until the next tick is on its way, waits (`settle`).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from bridge.endpoint import VEHICLE
-from plant_emulator.integrate import GOES_ON, Plant, advance, apply_due_commands, fill_row, push_command
-from plant_emulator.safety import SafetyEnvelope, clamp
-from plant_emulator.sensors import PositionSensor, add_noise, inertial_readings
+from plant_emulator.plant.integrate import GOES_ON, Plant, advance, apply_due_commands, fill_row, push_command
+from plant_emulator.plant.safety import SafetyEnvelope, clamp
+from plant_emulator.plant.sensors import PositionSensor, add_noise, inertial_readings
 from protocol.compiled import Packed, compiled, pack
-from protocol.frame_kernels import Bytes
-from protocol.mavlink_codec import FrameReader, FrameWriter
-from protocol.mavlink_map import ARMED
-from protocol.messages import FloatArray
+from protocol.messages import VEHICLE, FloatArray
 from protocol.scenario import Scenario
-from protocol.tick_frames import TickWriter, parse_command, write_tick
+from protocol.wire.codec import FrameReader, FrameWriter
+from protocol.wire.framing import Bytes
+from protocol.wire.mapping import ARMED
+from protocol.wire.tick_frames import TickWriter, parse_command, write_tick
 
 _NOT_PLAIN = -1
 

@@ -18,7 +18,7 @@
      |- Interrupted           130   the user stopped it
 
 The message of each is one sentence that names the place and the remedy; the command line prints it as it is, without a
-traceback. Bad data from the wire is never one of these: it is an event that is counted (see `mavlink_codec`).
+traceback. Bad data from the wire is never one of these: it is an event that is counted (see `codec`).
 """
 
 from __future__ import annotations

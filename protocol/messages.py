@@ -15,6 +15,8 @@ if TYPE_CHECKING:  # `--help` needs this module, and is there before numpy would
     import numpy.typing as npt
 
 AXES = ("x", "y", "z", "alpha", "beta", "gamma")
+VEHICLE = (1, 1)
+"""(system, component) of the controller, as of any autopilot."""
 AXIS_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 
 FloatArray: TypeAlias = "npt.NDArray[np.float64]"

@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 
 import controller.process as controller_process
 import plant_emulator.process
-from bridge.link import Link
+from bridge.links.link import Link
 from bridge.process import StopFlag
-from controller.laws import make_law
-from controller.process import ControllerOptions, serve
-from plant_emulator.process import EmulatorOptions, MotorLink, fly
+from controller.laws.law import make_law
+from controller.options import ControllerOptions
+from controller.process import serve
+from plant_emulator.options import EmulatorOptions, MotorLink
+from plant_emulator.process import fly
 from protocol.errors import FwavHilError
 from protocol.scenario import Scenario, find_scenario, load_scenario, with_overrides
 

@@ -7,16 +7,16 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common
 
-from bridge.link import Link
-from protocol import mavlink_map
+from bridge.links.link import Link
 from protocol.errors import LinkClosedError
-from protocol.mavlink_codec import FrameWriter
+from protocol.wire import mapping
+from protocol.wire.codec import FrameWriter
 
 
 def request(command: int, *parameters: float, target: int = 191) -> bytes:
     fields = {f"param{i + 1}": value for i, value in enumerate(parameters)}
-    payload = mavlink_map.COMMAND_LONG.pack_fields(command=command, target_system=1, target_component=target, **fields)
-    return FrameWriter(255, 190).seal(mavlink_map.COMMAND_LONG, payload)
+    payload = mapping.COMMAND_LONG.pack_fields(command=command, target_system=1, target_component=target, **fields)
+    return FrameWriter(255, 190).seal(mapping.COMMAND_LONG, payload)
 
 
 class Watcher:

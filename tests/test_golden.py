@@ -12,9 +12,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from bridge.memory import memory_pair
-from fwav_hil.replay.diff import LogDifference, Tolerances, compare_logs
-from protocol.log_scan import scan_tlog
+from bridge.links.memory import memory_pair
+from fwav_hil.replay.log_comparison import LogDifference, Tolerances, compare_logs
+from protocol.logs.scan import scan_tlog
 from protocol.scenario import Scenario
 from tests.loop import fly_both, scenario_of
 

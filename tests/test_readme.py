@@ -10,7 +10,7 @@ import pytest
 
 from fwav_hil.cli import COMMANDS, cli
 from protocol.scenario import find_scenario
-from protocol.streams import markdown_table
+from protocol.wire.streams import markdown_table
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -8,8 +8,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bridge.legs import ANSWER_COLUMNS, CONTROLLER_FILE, EMULATOR_FILE, SAMPLE_COLUMNS, TICK_COLUMNS, Rows, load_legs
-from bridge.timesync import Estimate
+from bridge.latency.segments import (
+    ANSWER_COLUMNS,
+    CONTROLLER_FILE,
+    EMULATOR_FILE,
+    SAMPLE_COLUMNS,
+    TICK_COLUMNS,
+    Rows,
+    load_legs,
+)
+from bridge.timing.timesync import Estimate
 from fwav_hil.latency.clocks import offset_at
 
 LEGS = {
@@ -67,7 +75,7 @@ def join_legs(folder: Path, controller_folder: Path | None = None) -> Legs:
 
 
 def legs_of(ticks: Rows, answers: Rows, samples: Rows, clock: Estimate | None, *, clocks: Rows | None = None) -> Legs:
-    """The legs of rows as `bridge.legs` describes them; samples whose command was never applied are left out.
+    """The legs of rows as `bridge.latency.segments` describes them; samples whose command was never applied are left out.
 
     clocks: where the ends have two, how they relate (CLOCK_COLUMNS); without a row nobody knows, and with it no leg from one
     end to the other.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from bridge.legs import Rows
+from bridge.latency.segments import Rows
 
 MOST_DRIFT = 1e-4
 """Two ordinary quartz clocks, of 50 ppm each, drift apart by this much at most."""

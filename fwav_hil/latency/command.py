@@ -101,7 +101,7 @@ def latency(
         return
     chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
     from bridge.process import StopFlag
-    from controller.laws import refuse_on_a_link
+    from controller.laws.registry import refuse_on_a_link
     from fwav_hil.compile import compile_kernels
     from fwav_hil.latency.study import LONGEST_PROBING_S, beside, closed_loop
     from fwav_hil.run import check_link

@@ -13,17 +13,17 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from bridge.clock import MonotonicClock
 from bridge.endpoint import Endpoint
-from bridge.link import Link, open_link
-from bridge.probes import ProbeResult, probe
+from bridge.latency.probes import ProbeResult, probe
+from bridge.links.link import Link, open_link
 from bridge.process import StopFlag
-from bridge.timesync import Estimate, TimeSync
+from bridge.timing.clock import MonotonicClock
+from bridge.timing.timesync import Estimate, TimeSync
 from fwav_hil.latency.echo import TICK_BYTES
-from protocol import mavlink_map
 from protocol.errors import PeerMissingError
-from protocol.mavlink_codec import FrameReader, FrameWriter
-from protocol.tick_frames import TickWriter
+from protocol.wire import mapping
+from protocol.wire.codec import FrameReader, FrameWriter
+from protocol.wire.tick_frames import TickWriter
 
 GROUND_STATION = (255, 190)
 EMULATOR = (1, 191)
@@ -40,20 +40,20 @@ def probe_time_sync(
     endpoint = Endpoint(link, *GROUND_STATION)
     numbers: dict[int, int] = {}
     best: dict[int, tuple[int, int]] = {}
-    others = TimeSync(endpoint, clock)
+    others = TimeSync(endpoint.seal, clock)
 
     def question(number: int) -> bytes:
         asked_ns = clock.now_ns()
         numbers[asked_ns] = number
-        return endpoint.seal(mavlink_map.TIMESYNC, mavlink_map.encode_timesync(0, asked_ns))
+        return endpoint.seal(mapping.TIMESYNC, mapping.encode_timesync(0, asked_ns))
 
     def answered(data: bytes) -> list[int]:
         arrived_ns = link.received_ns or clock.now_ns()
         found = []
         for frame in endpoint.reader.read(data):
-            if frame.message_id != mavlink_map.TIMESYNC.message_id or (frame.system, frame.component) == GROUND_STATION:
+            if frame.message_id != mapping.TIMESYNC.message_id or (frame.system, frame.component) == GROUND_STATION:
                 continue  # a line that gives back what is sent knows no time
-            answer_ns, asked_ns = mavlink_map.decode_timesync(frame.payload)
+            answer_ns, asked_ns = mapping.decode_timesync(frame.payload)
             if answer_ns == 0:  # the other end asks too
                 reply = others.take(frame, arrived_ns)
                 if reply:
@@ -83,7 +83,10 @@ def probe_time_sync(
 
 def probe_responder(stop: StopFlag, *, rate_hz: float, count: int, told: Told) -> ProbeResult:
     """TIMESYNC between two processes of ours over UDP."""
-    with _child("bridge.responder", "udpin://127.0.0.1:0") as said, open_link(said.replace("udpin", "udpout")) as link:
+    with (
+        _child("bridge.latency.responder", "udpin://127.0.0.1:0") as said,
+        open_link(said.replace("udpin", "udpout")) as link,
+    ):
         link.stamp_receives()
         return probe_time_sync(link, stop, rate_hz=rate_hz, count=count, told=told)[0]
 
@@ -112,12 +115,12 @@ def probe_mavutil(stop: StopFlag, *, rate_hz: float, count: int, told: Told) -> 
     def answered(data: bytes) -> list[int]:
         found = []
         for frame in reader.read(data):
-            if frame.message_id == mavlink_map.COMMAND.message_id:
+            if frame.message_id == mapping.COMMAND.message_id:
                 t_us = int.from_bytes(frame.payload[:8].ljust(8, b"\0"), "little")
                 found.append(round(t_us * 1000 / period_ns) - 1)
         return found
 
-    return _probe_port("protocol.mavutil_peer", stop, rate_hz, count, question, answered, told)
+    return _probe_port("protocol.wire.mavutil_peer", stop, rate_hz, count, question, answered, told)
 
 
 def _probe_port(

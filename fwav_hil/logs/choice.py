@@ -15,9 +15,9 @@ import numpy.typing as npt
 from fwav_hil.logs.working import Working
 from protocol.errors import LogError, UsageError
 from protocol.kernel_cache import cache_folder
-from protocol.log_dialect import layouts_by_name
-from protocol.log_files import Log, Sender, chosen_rows, open_log
-from protocol.log_scan import Scan
+from protocol.logs.dialect import layouts_by_name
+from protocol.logs.files import Log, Sender, chosen_rows, open_log
+from protocol.logs.scan import Scan
 
 _DAY_US = 86_400_000_000
 _TIME_OF_DAY = re.compile(r"(\d{1,2}):([0-5]\d):([0-5]\d(?:\.\d+)?)")

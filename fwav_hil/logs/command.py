@@ -61,7 +61,7 @@ def dump_command(
     """Print the messages of LOG, one a line, in their order."""
     from fwav_hil.logs.choice import choose, open_with_progress
     from fwav_hil.logs.dump import json_lines, text_lines
-    from protocol.log_files import messages
+    from protocol.logs.files import messages
 
     opened = open_with_progress(log)
     choice = choose(opened, types, systems, start, end)

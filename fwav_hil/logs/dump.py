@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from protocol.log_files import Message
+from protocol.logs.files import Message
 
 _DIGITS = 7  # of a float32
 

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from fwav_hil.logs.choice import Choice
 from fwav_hil.logs.working import Working
 from protocol.errors import RunFolderError
-from protocol.log_files import Log, fields_of, plain
+from protocol.logs.files import Log, fields_of, plain
 
 SUFFIXES = {"parquet": "_parquet", "csv": "_csv", "mcap": ".mcap"}
 _ROWS_AT_ONCE = 1 << 17

@@ -10,12 +10,12 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
-from bridge.sidecar import link_numbers, read_sidecar
+from bridge.recording.sidecar import link_numbers, read_sidecar
 from protocol.errors import RunFolderError
-from protocol.log_dialect import layouts
-from protocol.log_files import Log
-from protocol.log_scan import Scan
-from protocol.log_sequences import count_losses
+from protocol.logs.dialect import layouts
+from protocol.logs.files import Log
+from protocol.logs.scan import Scan
+from protocol.logs.sequences import count_losses
 
 GAP = 3.0
 """An interval longer than this many times the usual (median) one is a gap."""

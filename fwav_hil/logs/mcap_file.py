@@ -16,8 +16,8 @@ from mcap.writer import Writer
 
 from fwav_hil.logs.choice import Choice
 from fwav_hil.logs.working import Working
-from protocol.log_dialect import unit
-from protocol.log_files import Log, Message, fields_of, messages
+from protocol.logs.dialect import unit
+from protocol.logs.files import Log, Message, fields_of, messages
 
 _TELL_EVERY = 4096
 

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 
 from fwav_hil.logs.choice import Choice, near_matches
 from protocol.errors import RunFolderError, UsageError
-from protocol.log_dialect import unit
-from protocol.log_files import Log, fields_of
+from protocol.logs.dialect import unit
+from protocol.logs.files import Log, fields_of
 
 MOST_LINES = 16
 _FIELD = re.compile(r"(?P<message>\w+)\.(?P<field>\w+)(?:\[(?P<index>\d+)\])?$")

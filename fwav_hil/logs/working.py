@@ -8,7 +8,7 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from bridge.clock import MonotonicClock
+from bridge.timing.clock import MonotonicClock
 
 _PERIOD_NS = 2_000_000_000
 

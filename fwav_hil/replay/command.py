@@ -170,8 +170,8 @@ def _replay_into(
 ) -> int:
     from bridge.process import StopFlag
     from fwav_hil.compile import compile_kernels
-    from fwav_hil.replay.difference import plot_difference, print_difference
-    from fwav_hil.replay.recorded import recorded_run
+    from fwav_hil.replay.recorded_run import recorded_run
+    from fwav_hil.replay.replay_result import plot_difference, print_difference
 
     stop = StopFlag()
     stop.install()
@@ -200,8 +200,8 @@ def _replay_into(
 
 
 def _report_folder(out: Path | None, name: str) -> Path:
-    from bridge.clock import local_stamp
     from bridge.summary import make_folder
+    from bridge.timing.clock import local_stamp
 
     folder = out or Path("runs") / f"{name}-{local_stamp()}"
     if (folder / "difference.json").exists():

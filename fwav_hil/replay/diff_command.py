@@ -12,7 +12,7 @@ from bridge.command_line import json_option, options
 from bridge.summary import is_stdout, show_json
 
 if TYPE_CHECKING:
-    from fwav_hil.replay.diff import LogDifference
+    from fwav_hil.replay.log_comparison import LogDifference
 
 EXAMPLE = """
 \b
@@ -44,7 +44,7 @@ def diff_command(
     """
     from fwav_hil.logs.choice import held_names, names_in, open_telemetry
     from fwav_hil.replay.command import DIFFERENT
-    from fwav_hil.replay.diff import compare_logs, parse_tolerances
+    from fwav_hil.replay.log_comparison import compare_logs, parse_tolerances
 
     allowed = parse_tolerances(tolerances)
     (one, first_scan), (two, second_scan) = open_telemetry(first), open_telemetry(second)

@@ -8,19 +8,21 @@ from pathlib import Path
 
 import numpy as np
 
-from bridge.endpoint import VEHICLE, Endpoint
-from bridge.link import Link, open_link
+from bridge.endpoint import Endpoint
+from bridge.links.link import Link, open_link
 from bridge.process import StopFlag
-from controller.laws import make_law, refuse_on_a_link
+from controller.laws.law import make_law
+from controller.laws.registry import refuse_on_a_link
 from controller.parameters import followed
-from fwav_hil.replay.difference import Difference
 from fwav_hil.replay.other_end import other_end
-from fwav_hil.replay.recorded import Recorded, Tick
-from plant_emulator.pacing import RESEND_AFTER_S
-from plant_emulator.process import FAREWELLS, meet_controller
-from protocol import mavlink_map
+from fwav_hil.replay.recorded_run import Recorded, Tick
+from fwav_hil.replay.replay_result import Difference
+from plant_emulator.pacing.lockstep import RESEND_AFTER_S
+from plant_emulator.pacing.meeting import meet_controller
+from plant_emulator.process import FAREWELLS
 from protocol.errors import PeerLostError
-from protocol.messages import ActuatorCommand
+from protocol.messages import VEHICLE, ActuatorCommand
+from protocol.wire import mapping
 
 _LINK = "udpin://127.0.0.1:0"
 
@@ -36,16 +38,16 @@ def replay_in_process(run: Recorded) -> Difference:
         if (gains := followed(scenario, tick.parameters)) is not scenario:
             scenario = gains  # set while disarmed: the law starts again with them
             law.adopt(make_law(law.name, gains))
-        sample = mavlink_map.decode_pose(tick.pose)
+        sample = mapping.decode_pose(tick.pose)
         if sample is None or sample.t_ns != tick.t_ns or tick.t_ns in answers:
             continue  # as the controller does: no pose, no sample; a tick sent again is answered as before
         recorded = run.commands.get(tick.t_ns)
-        armed = recorded is None or bool(recorded[mavlink_map.COMMAND_MODE] & mavlink_map.ARMED)
+        armed = recorded is None or bool(recorded[mapping.COMMAND_MODE] & mapping.ARMED)
         if not (armed and was_armed):
             law.restart(state)
         was_armed = armed
         command = ActuatorCommand(sample.t_ns, law.step(state, sample.t_ns, sample.q), armed)
-        answers[tick.t_ns] = mavlink_map.encode_command(command, law.output.scale, lockstep=run.lockstep)
+        answers[tick.t_ns] = mapping.encode_command(command, law.output.scale, lockstep=run.lockstep)
     return compare_commands(run, answers)
 
 
@@ -77,9 +79,9 @@ def ask_controller(run: Recorded, link: Link, wait_s: float, stop: StopFlag) -> 
         stop.check()
         if tick.t_ns not in answers:
             answers[tick.t_ns] = _answer(endpoint, tick)
-    farewell = mavlink_map.encode_emulator_heartbeat(ending=True)
+    farewell = mapping.encode_emulator_heartbeat(ending=True)
     for _ in range(FAREWELLS):
-        endpoint.send([endpoint.seal(mavlink_map.HEARTBEAT, farewell)])
+        endpoint.send([endpoint.seal(mapping.HEARTBEAT, farewell)])
     return answers
 
 
@@ -88,9 +90,9 @@ def _answer(endpoint: Endpoint, tick: Tick) -> bytes:
         endpoint.link.send(tick.datagram)
         while frames := endpoint.receive(wait_s):
             for frame in frames:
-                payload = frame.payload.ljust(mavlink_map.COMMAND.size, b"\0")
+                payload = frame.payload.ljust(mapping.COMMAND.size, b"\0")
                 if (
-                    frame.message_id == mavlink_map.COMMAND.message_id
+                    frame.message_id == mapping.COMMAND.message_id
                     and int.from_bytes(payload[:8], "little") * 1000 == tick.t_ns
                 ):
                     return payload
@@ -104,10 +106,10 @@ def compare_commands(run: Recorded, answers: Mapping[int, bytes]) -> Difference:
     """The recorded commands and those of a replay, by the time of their sample: every byte of the payload counts."""
     both = sorted(run.commands.keys() & answers.keys())
     scale = np.array(run.scenario.actuators.scale)
-    size = mavlink_map.COMMAND.size
+    size = mapping.COMMAND.size
 
     def tau(payloads: list[bytes]) -> np.typing.NDArray[np.float64]:
-        table = np.frombuffer(b"".join(payloads), dtype=mavlink_map.COMMAND.dtype)
+        table = np.frombuffer(b"".join(payloads), dtype=mapping.COMMAND.dtype)
         return table["controls"][:, :6].astype(float) * scale if len(table) else np.empty((0, 6))
 
     recorded, replayed = [run.commands[t] for t in both], [answers[t].ljust(size, b"\0") for t in both]

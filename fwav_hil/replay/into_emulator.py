@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from bridge.endpoint import VEHICLE, Endpoint
-from bridge.link import Link
-from bridge.memory import memory_pair
+from bridge.endpoint import Endpoint
+from bridge.links.link import Link
+from bridge.links.memory import memory_pair
 from bridge.process import StopFlag, open_patiently
 from fwav_hil.children import Child, listen
-from fwav_hil.replay.difference import Difference
 from fwav_hil.replay.other_end import other_end
-from fwav_hil.replay.recorded import Recorded, Tick
+from fwav_hil.replay.recorded_run import Recorded, Tick
+from fwav_hil.replay.replay_result import Difference
 from plant_emulator.emulator import Emulator
-from protocol import mavlink_map
 from protocol.errors import PeerLostError, PeerMissingError
-from protocol.mavlink_codec import FrameReader
-from protocol.messages import FloatArray
+from protocol.messages import VEHICLE, FloatArray
+from protocol.wire import mapping
+from protocol.wire.codec import FrameReader
 
 _SILENCE_S = 3.0
 _HELLO_PERIOD_S = 0.1
@@ -42,7 +42,7 @@ def replay_in_process(run: Recorded) -> Difference:
             t_ns = number * period_ns
             sent[t_ns] = b"".join(emulator.sense(t_ns))
             for stamp_us, frame in tick.answers:
-                if frame.message_id != mavlink_map.COMMAND.message_id:
+                if frame.message_id != mapping.COMMAND.message_id:
                     continue
                 command = emulator.decode(frame.payload)
                 if command is None or command.t_ns <= newest_ns:
@@ -93,8 +93,8 @@ def answer_emulator(run: Recorded, link: Link, wait_s: float, stop: StopFlag) ->
     reader = FrameReader(is_datagram=True)
     answers = {tick.t_ns: tick.answer for tick in run.ticks}
     hello = [
-        (mavlink_map.HEARTBEAT, mavlink_map.encode_controller_heartbeat(armed=True)),
-        (mavlink_map.VERSION, mavlink_map.encode_version(run.scenario.digest())),
+        (mapping.HEARTBEAT, mapping.encode_controller_heartbeat(armed=True)),
+        (mapping.VERSION, mapping.encode_version(run.scenario.digest())),
     ]
     sent: dict[int, bytes] = {}
     waits = 0
@@ -109,10 +109,10 @@ def answer_emulator(run: Recorded, link: Link, wait_s: float, stop: StopFlag) ->
                 "the emulator fell silent during the replay: see whether the scenario is that of the log"
             )
         for frame in reader.read(data or b""):
-            if frame.message_id == mavlink_map.HEARTBEAT.message_id and mavlink_map.heartbeat_is_ending(frame.payload):
+            if frame.message_id == mapping.HEARTBEAT.message_id and mapping.heartbeat_is_ending(frame.payload):
                 return sent
-            if frame.message_id == mavlink_map.TICK.message_id and data:
-                t_ns = mavlink_map.decode_tick_time_ns(frame.payload)
+            if frame.message_id == mapping.TICK.message_id and data:
+                t_ns = mapping.decode_tick_time_ns(frame.payload)
                 sent[t_ns] = data
                 if not answers.get(t_ns):
                     raise PeerLostError(f"the log holds no command for t = {t_ns * 1e-9:.3f} s: replay it with --fast")
@@ -126,11 +126,11 @@ def compare_motion(run: Recorded, sent: Mapping[int, bytes]) -> Difference:
     reader = FrameReader(is_datagram=True, follow_sequence=False)
 
     def pose(payload: bytes) -> FloatArray:
-        sample = mavlink_map.decode_pose(payload)
+        sample = mapping.decode_pose(payload)
         return sample.q if sample else np.full(6, np.nan)
 
     def pose_in(datagram: bytes) -> bytes:
-        return next((f.payload for f in reader.read(datagram) if f.message_id == mavlink_map.POSE.message_id), b"")
+        return next((f.payload for f in reader.read(datagram) if f.message_id == mapping.POSE.message_id), b"")
 
     def equal(tick: Tick) -> bool:
         return tick.datagram == sent[tick.t_ns]

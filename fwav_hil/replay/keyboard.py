@@ -10,7 +10,7 @@ import tty
 from collections.abc import Callable, Mapping
 from types import MappingProxyType, TracebackType
 
-from bridge.replay import Player
+from bridge.recording.replay import Player
 
 SEEK_S = 5.0
 HELP = "space: hold, go on   n: one frame   left, right: 5 s back, ahead   up, down: 60 s   q: end"

@@ -13,18 +13,19 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 
-from bridge.clock import Clock, PunctualClock, unix_time_us
-from bridge.link import NOBODY, Link
-from bridge.process import Report, StopFlag, open_patiently
-from bridge.realtime import Settings, maybe_real_time, own_core, report_settings
-from bridge.replay import Player, log_times_ns
+from bridge.links.link import NOBODY, Link
+from bridge.process import StopFlag, open_patiently
+from bridge.recording.replay import Player, log_times_ns
+from bridge.reporting import Report
 from bridge.summary import percentiles_us
+from bridge.timing.clock import Clock, PunctualClock, unix_time_us
+from bridge.timing.realtime import Settings, maybe_real_time, own_core, report_settings
 from fwav_hil.logs.choice import time_of_day
 from fwav_hil.progress import StatusLine
 from fwav_hil.replay.keyboard import HELP, Keyboard
 from protocol.errors import PeerMissingError, UsageError
-from protocol.log_scan import Scan
-from protocol.retime import Signer, TimeMover, read_key
+from protocol.logs.retime import Signer, TimeMover, read_key
+from protocol.logs.scan import Scan
 
 _DRAIN_LIMIT = 100
 _DRAW_PERIOD_NS = 200_000_000

@@ -1,8 +1,9 @@
 """The describing function of the gears, and the limit cycles that it predicts (harmonic balance).
 
-tau = A sin(phi) goes through the gear's own step function (`plant_emulator.backlash`) until it repeats; the first harmonic
-of what comes out over that of what went in is N(A): complex, and the same at every frequency, since the gear has no time of
-its own. A constant share of tau changes nothing. A gear of slope h has N = h; the hysteresis has |N| < h and a phase lag.
+tau = A sin(phi) goes through the gear's own step function (`plant_emulator.plant.backlash`) until it repeats; the first
+harmonic of what comes out over that of what went in is N(A): complex, and the same at every frequency, since the gear has no
+time of its own. A constant share of tau changes nothing. A gear of slope h has N = h; the hysteresis has |N| < h and a
+phase lag.
 
 In the linear loop N(A) takes the place of h. A limit cycle is where 1 + N(A) L(j omega) = 0: where a pole of the loop with
 that gain is on the unit circle. It attracts where the loop grows at smaller amplitudes and decays at larger ones.
@@ -17,7 +18,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from fwav_hil.studies.loop_model import Channel
-from plant_emulator.backlash import BACKLASH, PLAY, gear_parameters, gear_step
+from plant_emulator.plant.backlash import BACKLASH, PLAY, gear_parameters, gear_step
 from protocol.compiled import compiled
 from protocol.messages import FloatArray
 from protocol.scenario import Backlash, Play

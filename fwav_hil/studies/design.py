@@ -20,9 +20,9 @@ import msgspec
 import numpy as np
 from scipy.optimize import Bounds, OptimizeResult, differential_evolution
 
-from controller.law import Law
-from controller.laws import make_law, make_realisation
-from controller.realisation import Realisation
+from controller.laws.law import Law, make_law
+from controller.laws.registry import make_realisation
+from controller.laws.state_space import Realisation
 from fwav_hil.score import SETTLED_S, tracking_error
 from fwav_hil.simulate import simulate
 from fwav_hil.studies.flight_check import judge_flight

@@ -17,8 +17,7 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 
-from controller.law import Law
-from controller.laws import make_law
+from controller.laws.law import Law, make_law
 from fwav_hil.score import desired_positions, tracking_error
 from fwav_hil.simulate import Simulation, simulate
 from protocol.messages import AXES, FloatArray

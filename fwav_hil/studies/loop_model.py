@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from controller.laws import make_realisation
-from controller.realisation import ERROR, ERROR_RATE, POSITION, VELOCITY, Realisation
+from controller.laws.registry import make_realisation
+from controller.laws.state_space import ERROR, ERROR_RATE, POSITION, VELOCITY, Realisation
 from protocol.messages import AXES, FloatArray
 from protocol.scenario import NANOSECONDS, Scenario
 

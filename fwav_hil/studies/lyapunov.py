@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from controller.reference import reference_trajectory
+from controller.laws.reference import reference_trajectory
 from fwav_hil.simulate import Simulation
 from protocol.messages import FloatArray
 from protocol.scenario import NANOSECONDS, Scenario

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from fwav_hil.studies.describing import Gear, describing_function, gears
 from fwav_hil.studies.margin_study import Region, Study
-from plant_emulator.backlash import gear_step
+from plant_emulator.plant.backlash import gear_step
 from protocol.errors import RunFolderError
 from protocol.messages import FloatArray
 from protocol.scenario import NANOSECONDS

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from controller.laws import make_law
+from controller.laws.law import make_law
 from fwav_hil.run import RunOptions, run
 from fwav_hil.run_folder import FILES, new_folder
 from fwav_hil.score import scores
 from fwav_hil.simulate import Simulation, simulate
-from plant_emulator.truth import load_truth
+from plant_emulator.plant.truth import load_truth
 from protocol.messages import AXES
 from protocol.scenario import Scenario
 

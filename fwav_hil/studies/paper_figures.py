@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from fwav_hil.score import tracking_error
 from fwav_hil.studies.lyapunov import lyapunov
 from fwav_hil.studies.paper import CENTIMETRES, Flight
-from plant_emulator.backlash import GearHysteresis
+from plant_emulator.plant.backlash import GearHysteresis
 from protocol.errors import RunFolderError
 from protocol.messages import AXES, FloatArray
 from protocol.scenario import NANOSECONDS, Backlash, Play

@@ -6,11 +6,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from bridge.endpoint import VEHICLE, Endpoint, refuse_other_scenario
-from bridge.link import Link
-from bridge.memory import memory_pair
+from bridge.endpoint import Endpoint, refuse_other_scenario
+from bridge.links.link import Link
+from bridge.links.memory import memory_pair
 from protocol.errors import LinkClosedError, ScenarioMismatchError
-from protocol.mavlink_codec import CAUSES, layout
+from protocol.messages import VEHICLE
+from protocol.wire.codec import CAUSES, layout
 
 EMULATOR = (1, 191)
 HEARTBEAT, STATUSTEXT = layout("HEARTBEAT"), layout("STATUSTEXT")

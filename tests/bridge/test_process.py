@@ -18,7 +18,8 @@ import pytest
 
 import bridge
 from bridge.command_line import run_command
-from bridge.process import StopFlag, end_with_parent, report_json, sit_on_core
+from bridge.process import StopFlag, end_with_parent, sit_on_core
+from bridge.reporting import report_json
 from fwav_hil.cli import cli
 from protocol.errors import Interrupted
 

@@ -7,9 +7,9 @@ import math
 import pytest
 
 from bridge.requests import NEVER, Requests, Saying
-from protocol import mavlink_map
-from protocol.mavlink_codec import Frame, FrameReader, FrameWriter, layout
-from protocol.requests import Request, Result
+from protocol.wire import mapping
+from protocol.wire.codec import Frame, FrameReader, FrameWriter, layout
+from protocol.wire.requests import Request, Result
 
 ME = (1, 191)
 STATE, ODOMETRY = 115, 331
@@ -18,10 +18,10 @@ MS = 1_000_000
 
 def command(number: int, *parameters: float, target: tuple[int, int] = ME) -> Frame:
     fields = {f"param{i + 1}": value for i, value in enumerate([*parameters, *[math.nan] * 7][:7])}
-    payload = mavlink_map.COMMAND_LONG.pack_fields(
+    payload = mapping.COMMAND_LONG.pack_fields(
         command=number, target_system=target[0], target_component=target[1], **fields
     )
-    (read,) = FrameReader(is_datagram=True).read(FrameWriter(255, 190).seal(mavlink_map.COMMAND_LONG, payload))
+    (read,) = FrameReader(is_datagram=True).read(FrameWriter(255, 190).seal(mapping.COMMAND_LONG, payload))
     return read
 
 

@@ -7,22 +7,22 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common
 
-from bridge.clock import VirtualClock
-from bridge.link import open_link
-from bridge.memory import memory_pair
+from bridge.links.link import open_link
+from bridge.links.memory import memory_pair
+from bridge.links.tcp import TcpIn
 from bridge.process import StopFlag
 from bridge.station import Station, open_station
-from bridge.tcp import TcpIn
-from protocol import mavlink_map
+from bridge.timing.clock import VirtualClock
 from protocol.errors import LinkUriError
-from protocol.mavlink_codec import FrameReader, FrameWriter
-from protocol.tlog import TlogWriter, read_tlog
+from protocol.logs.tlog import TlogWriter, read_tlog
+from protocol.wire import mapping
+from protocol.wire.codec import FrameReader, FrameWriter
 
 WHO = (1, 191)
 
 
 def heartbeat() -> bytes:
-    return mavlink_map.encode_emulator_heartbeat()
+    return mapping.encode_emulator_heartbeat()
 
 
 def names(data: bytes | None) -> list[str]:
@@ -45,12 +45,12 @@ def test_what_is_said_both_ways_is_recorded_under_the_time_given(tmp_path: Path)
     near, far = memory_pair()
     log = TlogWriter(tmp_path / "station.tlog")
     station = Station(near, WHO, VirtualClock(), heartbeat, log)
-    far.send(FrameWriter(255, 190).seal(mavlink_map.HEARTBEAT, heartbeat()))
+    far.send(FrameWriter(255, 190).seal(mapping.HEARTBEAT, heartbeat()))
     station.t_us = 1_234
     (frame,) = station.poll()
     assert (frame.system, frame.component) == (255, 190)
     station.t_us = 5_678
-    station.say(mavlink_map.COMMAND_ACK, mavlink_map.COMMAND_ACK.pack_fields(command=511))
+    station.say(mapping.COMMAND_ACK, mapping.COMMAND_ACK.pack_fields(command=511))
     log.close()
     kept = [(t_us, frame.system, frame.message_id) for t_us, frame in read_tlog(tmp_path / "station.tlog")]
     assert kept == [(1_234, 1, 0), (1_234, 255, 0), (5_678, 1, 77)]
@@ -62,15 +62,15 @@ def test_a_station_that_leaves_is_no_matter_and_another_may_come() -> None:
         station = Station(near, WHO, VirtualClock(), heartbeat)
         for _ in range(2):
             with open_link(f"tcpout://127.0.0.1:{near.port}") as far:
-                far.send(FrameWriter(255, 190).seal(mavlink_map.HEARTBEAT, heartbeat()))
+                far.send(FrameWriter(255, 190).seal(mapping.HEARTBEAT, heartbeat()))
                 while not station.poll():
                     near._wait(0.1, readable=(near._listener.fileno(),))
-                station.say(mavlink_map.COMMAND_ACK, b"\1")
+                station.say(mapping.COMMAND_ACK, b"\1")
                 reader = FrameReader(is_datagram=False)
                 assert [f.message_id for f in reader.read(far.recv(5.0) or b"")][-1:] == [77]
             for _ in range(50):
                 station.poll()
-                station.say(mavlink_map.COMMAND_ACK, b"\1")
+                station.say(mapping.COMMAND_ACK, b"\1")
 
 
 def test_no_link_is_no_station_and_a_wrong_one_is_said() -> None:

@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from controller.law import Law, LawState
-from controller.laws import LAWS, make_law
+from controller.laws.law import Law, LawState, make_law
+from controller.laws.registry import LAWS
 from fwav_hil.simulate import simulate
 from protocol.errors import UsageError
 from protocol.messages import FloatArray

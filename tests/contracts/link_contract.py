@@ -8,8 +8,8 @@ from collections.abc import Iterator, Sequence
 
 import pytest
 
-from bridge.clock import MonotonicClock
-from bridge.link import Link
+from bridge.links.link import Link
+from bridge.timing.clock import MonotonicClock
 from protocol.errors import LinkClosedError
 
 PATIENCE_S = 10.0

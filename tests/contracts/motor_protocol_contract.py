@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from protocol.can_frame import LONGEST_DATA, CanFrame
-from protocol.motor_lockstep import is_simulation_only
-from protocol.motor_protocol import (
+from protocol.motors.motor_protocol import (
     DRIVES,
     Action,
     Cause,
@@ -20,6 +19,7 @@ from protocol.motor_protocol import (
     make_host,
     traffic,
 )
+from protocol.motors.simulation_sync import is_simulation_only
 from protocol.scenario import Motor
 
 

@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 
 from bridge.endpoint import Endpoint
-from bridge.memory import memory_pair
+from bridge.links.memory import memory_pair
 from bridge.process import StopFlag
-from controller.laws import LAWS, make_law
-from controller.process import ControllerOptions, serve, warm_up
-from protocol import mavlink_map
-from protocol.mavlink_codec import Layout, layout
+from controller.laws.law import make_law
+from controller.laws.registry import LAWS
+from controller.options import ControllerOptions
+from controller.process import serve, warm_up
 from protocol.scenario import Scenario
+from protocol.wire import mapping
+from protocol.wire.codec import Layout, layout
 from tests.loop import scenario_of
 
 TICKS = 60
@@ -46,27 +48,27 @@ def commands(scenario: Scenario, generator: random.Random | None) -> list[bytes]
     with near, far:
         thread.start()
         emulator = Endpoint(near, 1, scenario.wire.emulator_component)
-        version = mavlink_map.encode_version(scenario.digest())
-        emulator.send([emulator.seal(mavlink_map.VERSION, version)])
+        version = mapping.encode_version(scenario.digest())
+        emulator.send([emulator.seal(mapping.VERSION, version)])
         poses = np.random.default_rng(5).normal(0.0, 0.05, (TICKS, 6)) + 0.1
         for tick in range(TICKS):
             t_ns = tick * scenario.period_ns
             readings = np.zeros(13)
-            payload = mavlink_map.encode_tick(t_ns, readings)
+            payload = mapping.encode_tick(t_ns, readings)
             frames = []
             if generator:
                 # The instance id stays 0: it says which sensor speaks, and instance 0 is the tick.
-                payload = noise_payload(mavlink_map.TICK, generator, keep_time=payload[:8])[:64]
+                payload = noise_payload(mapping.TICK, generator, keep_time=payload[:8])[:64]
                 for name in NOISY:
                     frames.append(emulator.seal(layout(name), noise_payload(layout(name), generator)))
-            frames.append(emulator.seal(mavlink_map.POSE, mavlink_map.encode_pose(t_ns, poses[tick])))
-            frames.append(emulator.seal(mavlink_map.TICK, payload))
+            frames.append(emulator.seal(mapping.POSE, mapping.encode_pose(t_ns, poses[tick])))
+            frames.append(emulator.seal(mapping.TICK, payload))
             emulator.send(frames)
             while len(answers) <= tick:
                 received = emulator.receive(5.0)
                 assert received, "no answer"
-                answers += [f.payload for f in received if f.message_id == mavlink_map.COMMAND.message_id]
-        emulator.send([emulator.seal(mavlink_map.HEARTBEAT, mavlink_map.encode_emulator_heartbeat(ending=True))])
+                answers += [f.payload for f in received if f.message_id == mapping.COMMAND.message_id]
+        emulator.send([emulator.seal(mapping.HEARTBEAT, mapping.encode_emulator_heartbeat(ending=True))])
         thread.join(10.0)
         assert not thread.is_alive()
     return answers

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common
 
-from controller.laws import LAWS, make_law
-from controller.parameter_server import BURST, ParameterServer
+from controller.laws.law import make_law
+from controller.laws.registry import LAWS
 from controller.parameters import Parameters, changed, markdown_table, parameters_of, value_of
+from controller.station.parameter_server import BURST, ParameterServer
 from protocol.errors import ScenarioError, UsageError
-from protocol.mavlink_codec import FrameReader, FrameWriter
-from protocol.parameter_map import Kind, Refusal, decode_value
 from protocol.scenario import Scenario
+from protocol.wire.codec import FrameReader, FrameWriter
+from protocol.wire.parameter_mapping import Kind, Refusal, decode_value
 from tests.loop import scenario_of
 
 FLAPPER = scenario_of("flapper")

@@ -7,15 +7,14 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from bridge.endpoint import VEHICLE, Endpoint
-from bridge.memory import memory_pair
-from controller.law import Law, LawState
-from controller.laws import make_law
+from bridge.endpoint import Endpoint
+from bridge.links.memory import memory_pair
+from controller.laws.law import Law, LawState, make_law
 from controller.quick import NOT_PLAIN, QuickAnswers
-from protocol import mavlink_map
-from protocol.mavlink_codec import FrameWriter
-from protocol.messages import ActuatorCommand, FloatArray
-from protocol.tick_frames import CommandWriter, TickWriter
+from protocol.messages import VEHICLE, ActuatorCommand, FloatArray
+from protocol.wire import mapping
+from protocol.wire.codec import FrameWriter
+from protocol.wire.tick_frames import CommandWriter, TickWriter
 from tests.loop import scenario_of
 
 FLAPPER = scenario_of("flapper")
@@ -59,7 +58,7 @@ def test_the_short_way_gives_the_same_bytes_as_the_long_one(law_name: str) -> No
         q = FLAPPER.initial_motion[:6] + 0.01 * random.normal(size=6)
         end.quick.get_ready(after_ns, FOREVER_NS)
         answered_ns, frame = end.quick.to(tick(writer, t_ns, q))
-        sample = mavlink_map.decode_pose(mavlink_map.encode_pose(t_ns, q))
+        sample = mapping.decode_pose(mapping.encode_pose(t_ns, q))
         assert sample is not None
         assert answered_ns == t_ns
         assert frame == commands.frame(ActuatorCommand(t_ns, law.step(state, t_ns, sample.q), armed=True))
@@ -93,6 +92,6 @@ def test_a_plain_sample_is_answered_at_once() -> None:
     end.quick.get_ready(0, FOREVER_NS)
     t_ns, frame = end.quick.to(tick(FrameWriter(VEHICLE[0], EMULATOR), PERIOD_NS, np.zeros(6)))
     assert t_ns == PERIOD_NS
-    command = mavlink_map.decode_command(frame[10:-2], np.array(FLAPPER.actuators.scale))
+    command = mapping.decode_command(frame[10:-2], np.array(FLAPPER.actuators.scale))
     assert command is not None
     assert (command.t_ns, command.armed) == (PERIOD_NS, True)

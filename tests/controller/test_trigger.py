@@ -8,15 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bridge.clock import VirtualClock
-from bridge.link import Link
-from bridge.memory import memory_pair
+from bridge.links.link import Link
+from bridge.links.memory import memory_pair
 from bridge.process import StopFlag
-from controller.laws import make_law
-from controller.process import Controller, ControllerOptions, warm_up
-from protocol import mavlink_map
+from bridge.timing.clock import VirtualClock
+from controller.laws.law import make_law
+from controller.options import ControllerOptions
+from controller.process import Controller, warm_up
 from protocol.errors import PeerLostError
-from protocol.mavlink_codec import FrameReader, FrameWriter
+from protocol.wire import mapping
+from protocol.wire.codec import FrameReader, FrameWriter
 from tests.loop import fly_both, scenario_of
 
 SCENARIO = scenario_of("flapper")
@@ -59,7 +60,7 @@ def serve(
     warm_up(law)
     clock = VirtualClock()
     writer = FrameWriter(1, SCENARIO.wire.emulator_component)
-    version = writer.seal(mavlink_map.VERSION, mavlink_map.encode_version(SCENARIO.digest()))
+    version = writer.seal(mapping.VERSION, mapping.encode_version(SCENARIO.digest()))
     link = Timed(clock, [(0, version), *arrivals_ns(writer)])
     options = ControllerOptions(link="-", clock="realtime", trigger=trigger)
     controller = Controller(SCENARIO, law, link, options, clock, StopFlag(), spin_ns)
@@ -69,13 +70,13 @@ def serve(
 
 def sample(writer: FrameWriter, tick: int) -> bytes:
     t_ns = tick * PERIOD_NS
-    return writer.seal(mavlink_map.POSE, mavlink_map.encode_pose(t_ns, np.full(6, 0.1))) + writer.seal(
-        mavlink_map.TICK, mavlink_map.encode_tick(t_ns, np.zeros(13))
+    return writer.seal(mapping.POSE, mapping.encode_pose(t_ns, np.full(6, 0.1))) + writer.seal(
+        mapping.TICK, mapping.encode_tick(t_ns, np.zeros(13))
     )
 
 
 def ending(writer: FrameWriter) -> bytes:
-    return writer.seal(mavlink_map.HEARTBEAT, mavlink_map.encode_emulator_heartbeat(ending=True))
+    return writer.seal(mapping.HEARTBEAT, mapping.encode_emulator_heartbeat(ending=True))
 
 
 def echoes(link: Timed) -> list[tuple[int, int]]:
@@ -84,7 +85,7 @@ def echoes(link: Timed) -> list[tuple[int, int]]:
     found = []
     for at_ns, data in link.sent:
         for frame in reader.read(data):
-            if frame.message_id == mavlink_map.COMMAND.message_id:
+            if frame.message_id == mapping.COMMAND.message_id:
                 found.append((at_ns, int.from_bytes(frame.payload[:8], "little") * 1000 // PERIOD_NS))
     return found
 

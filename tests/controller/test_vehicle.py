@@ -7,12 +7,12 @@ import math
 import pytest
 
 from bridge.endpoint import Endpoint
-from bridge.memory import memory_pair
+from bridge.links.memory import memory_pair
 from controller.vehicle import Vehicle
-from protocol import mavlink_map
 from protocol.errors import ScenarioMismatchError
-from protocol.mavlink_codec import Frame, FrameReader, FrameWriter, Layout
-from protocol.requests import ARM_DISARM
+from protocol.wire import mapping
+from protocol.wire.codec import Frame, FrameReader, FrameWriter, Layout
+from protocol.wire.requests import ARM_DISARM
 
 DIGEST = b"12345678"
 
@@ -23,17 +23,17 @@ def frame(system: int, component: int, message: Layout, payload: bytes) -> Frame
 
 
 def request(param1: float, *, target: tuple[int, int] = (1, 1), command: int = ARM_DISARM) -> Frame:
-    payload = mavlink_map.COMMAND_LONG.pack_fields(
+    payload = mapping.COMMAND_LONG.pack_fields(
         command=command, param1=param1, param2=math.nan, target_system=target[0], target_component=target[1]
     )
-    return frame(255, 190, mavlink_map.COMMAND_LONG, payload)
+    return frame(255, 190, mapping.COMMAND_LONG, payload)
 
 
 def vehicle(*, arm: bool = False, agreed: bool = True) -> Vehicle:
     near, _ = memory_pair()
     made = Vehicle(Endpoint(near, 1, 1), DIGEST, 191, arm=arm)
     if agreed:
-        made.take(frame(1, 191, mavlink_map.VERSION, mavlink_map.encode_version(DIGEST)))
+        made.take(frame(1, 191, mapping.VERSION, mapping.encode_version(DIGEST)))
     return made
 
 
@@ -73,4 +73,4 @@ def test_it_does_not_arm_before_the_emulator_has_shown_the_same_scenario() -> No
 
 def test_another_scenario_is_refused() -> None:
     with pytest.raises(ScenarioMismatchError):
-        vehicle().take(frame(1, 191, mavlink_map.VERSION, mavlink_map.encode_version(b"87654321")))
+        vehicle().take(frame(1, 191, mapping.VERSION, mapping.encode_version(b"87654321")))

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from bridge.command_line import run_command
-from bridge.wake_up import Trial
+from bridge.timing.wake_up import Trial
 from fwav_hil.cli import cli
 from fwav_hil.doctor_command import verdict
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from fwav_hil.plots import _show_limits, plot_run
 from fwav_hil.simulate import simulate
-from fwav_hil.simulated import ground_truth
+from fwav_hil.simulation_results import ground_truth
 from protocol.errors import RunFolderError
 from protocol.scenario import find_scenario, load_scenario
 

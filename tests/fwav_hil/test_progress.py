@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.clock import VirtualClock
+from bridge.timing.clock import VirtualClock
 from fwav_hil import progress
 from fwav_hil.progress import Progress
 

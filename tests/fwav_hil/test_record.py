@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common
 
-from bridge.clock import unix_time_us
 from bridge.process import StopFlag
-from bridge.sidecar import link_numbers, read_sidecar
+from bridge.recording.sidecar import link_numbers, read_sidecar
+from bridge.timing.clock import unix_time_us
 from fwav_hil.record import record
 from protocol.errors import LinkError, PeerMissingError, RunFolderError
-from protocol.log_scan import scan_tlog
-from tests.bridge.test_recorder import numbered, wait_until
+from protocol.logs.scan import scan_tlog
+from tests.bridge.recording.test_thread_recorder import numbered, wait_until
 from tests.disk import small_disk
 from tests.fwav_hil.replay.conftest import Command, fwav_hil
 

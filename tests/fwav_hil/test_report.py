@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from controller.reference import reference_trajectory
+from controller.laws.reference import reference_trajectory
 from fwav_hil.report import summarise
-from plant_emulator.truth import ROW
+from plant_emulator.plant.truth import ROW
 from protocol.errors import RunFolderError, ScenarioError
 from protocol.messages import AXES
 from protocol.scenario import find_scenario, load_scenario

@@ -23,11 +23,11 @@ import numpy as np
 import pytest
 
 import fwav_hil.run
-from bridge.clock import MonotonicClock
+from bridge.timing.clock import MonotonicClock
 from fwav_hil.run import RunOptions
 from fwav_hil.simulate import simulate
 from fwav_hil.studies.margin import budget_line
-from plant_emulator.truth import load_truth
+from plant_emulator.plant.truth import load_truth
 from protocol.errors import FwavHilError
 from tests.loop import scenario_of
 

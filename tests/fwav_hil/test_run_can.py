@@ -16,13 +16,13 @@ import pytest
 
 from fwav_hil.compile import compile_kernels
 from fwav_hil.simulate import simulate
-from plant_emulator.motor_node import is_of_drives, warm_up
-from plant_emulator.truth import load_truth
-from protocol import motor_lockstep
+from plant_emulator.drives.motor_node import is_of_drives, warm_up
+from plant_emulator.plant.truth import load_truth
 from protocol.can_frame import CanFrame
-from protocol.can_stuffing import exact_bits
+from protocol.motors import simulation_sync
+from protocol.motors.can_stuffing import exact_bits
 from protocol.scenario import find_scenario
-from tests.bridge.test_can_bus import free_group
+from tests.bridge.motor_bus.test_can_bus import free_group
 from tests.dbc import published_odrive_dbc
 from tests.fwav_hil.test_run import FREE, PATIENCE_S, assert_one_line, call, flying, started, wait_until
 from tests.loop import scenario_of
@@ -43,7 +43,7 @@ def compiled_kernels() -> None:
 def drives_of(place: str) -> int | None:
     """The process id of the drives that work for a folder or bus."""
     listed = subprocess.run(["ps", "-ww", "-eo", "pid,args"], capture_output=True, text=True, check=True).stdout
-    found = re.findall(r"^\s*(\d+) .* -m plant_emulator.motor_command (.*)$", listed, re.MULTILINE)
+    found = re.findall(r"^\s*(\d+) .* -m plant_emulator.drives.motor_command (.*)$", listed, re.MULTILINE)
     return next((int(pid) for pid, arguments in found if place in arguments), None)
 
 
@@ -66,7 +66,7 @@ def test_three_processes_fly_as_the_simulation_does(tmp_path: Path) -> None:
     messages = [CanFrame(m.arbitration_id, bytes(m.data)) for m in can.LogReader(tmp_path / "bus.log")]
     assert len(messages) > 13 * 100
     assert any(is_of_drives(frame) for frame in messages)
-    lockstep = Path(motor_lockstep.__file__).with_suffix(".dbc")
+    lockstep = Path(simulation_sync.__file__).with_suffix(".dbc")
     decoded = subprocess.run(
         [sys.executable, "-m", "cantools", "decode", "--single-line", str(lockstep)],
         input=(tmp_path / "bus.log").read_text(), capture_output=True, text=True, check=True, timeout=PATIENCE_S,

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from controller.reference import reference_trajectory
+from controller.laws.reference import reference_trajectory
 from fwav_hil.score import desired_positions, scores, tracking_error
 from protocol.messages import AXES, FloatArray
 from protocol.scenario import ZERO6, Scenario, find_scenario, load_scenario

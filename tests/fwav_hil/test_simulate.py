@@ -9,17 +9,17 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from controller.laws import make_law
-from controller.reference import reference_trajectory
+from controller.laws.law import make_law
+from controller.laws.reference import reference_trajectory
 from fwav_hil.simulate import Simulation, simulate
-from plant_emulator.backlash import GearHysteresis
-from plant_emulator.integrate import PENDING, Plant
-from plant_emulator.safety import SafetyEnvelope
-from plant_emulator.sensors import PositionSensor
-from protocol import mavlink_map
+from plant_emulator.plant.backlash import GearHysteresis
+from plant_emulator.plant.integrate import PENDING, Plant
+from plant_emulator.plant.safety import SafetyEnvelope
+from plant_emulator.plant.sensors import PositionSensor
 from protocol.errors import UsageError
 from protocol.messages import ActuatorCommand, FloatArray
 from protocol.scenario import Delay, Noise, Play, Scenario, find_scenario, load_scenario
+from protocol.wire import mapping
 
 FLAPPER = load_scenario(find_scenario("flapper"))
 PAPER = load_scenario(find_scenario("paper"))
@@ -200,10 +200,10 @@ def test_the_loop_is_the_parts_of_the_two_ends_put_together() -> None:
     rows = []
     for k in range(scenario.ticks):
         t_ns = k * scenario.period_ns
-        sample = mavlink_map.decode_pose(mavlink_map.encode_pose(t_ns, sensor.measure(t_ns, plant.state.motion).q))
+        sample = mapping.decode_pose(mapping.encode_pose(t_ns, sensor.measure(t_ns, plant.state.motion).q))
         assert sample is not None
         said = ActuatorCommand(sample.t_ns, law.step(state, sample.t_ns, sample.q), armed=True)
-        heard = mavlink_map.decode_command(mavlink_map.encode_command(said, scale, lockstep=True), scale)
+        heard = mapping.decode_command(mapping.encode_command(said, scale, lockstep=True), scale)
         assert heard is not None
         plant.command(t_ns + scenario.delay_ns, envelope.accept(t_ns, heard))
         plant.apply_due_commands()

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bridge.link import open_link
-from bridge.memory import memory_pair
-from plant_emulator.process import MotorLink
-from plant_emulator.truth import load_truth
-from protocol import mavlink_map
-from protocol.mavlink_codec import layout
-from protocol.tlog import read_tlog
+from bridge.links.link import open_link
+from bridge.links.memory import memory_pair
+from plant_emulator.options import MotorLink
+from plant_emulator.plant.truth import load_truth
+from protocol.logs.tlog import read_tlog
+from protocol.wire import mapping
+from protocol.wire.codec import layout
 from tests.loop import fly_both, scenario_of
-from tests.plant_emulator.test_lockstep import Faulty
+from tests.plant_emulator.pacing.test_lockstep import Faulty
 from tests.station import Watcher, request
 
 SHORT = scenario_of("flapper", duration_s=0.4)
@@ -55,7 +55,7 @@ def test_the_controller_is_none_the_wiser_and_the_log_is_the_same_each_time(tmp_
         near, far = memory_pair()
         with near, far:
             fly_both(SHORT, near, far, tmp_path / name, truth_hz=truth_hz)
-    command = mavlink_map.COMMAND
+    command = mapping.COMMAND
     sent = [frames_of(tmp_path / name / "run.tlog", command) for name in ("without", "with")]
     assert sent[0] == sent[1]
     assert len(sent[0]) == SHORT.ticks
@@ -80,7 +80,7 @@ def test_a_peer_on_the_loops_link_asks_and_is_answered_there(clock: str, tmp_pat
     assert isinstance(ends.emulator, dict), ends
     counters = ends.emulator["counters"]
     assert (counters["requests"], counters["requests_refused"]) == (4, 1)
-    answers = frames_of(tmp_path / "run.tlog", mavlink_map.COMMAND_ACK)
+    answers = frames_of(tmp_path / "run.tlog", mapping.COMMAND_ACK)
     assert [(one["command"], one["result"]) for one in answers] == [(511, 0), (512, 0), (511, 2), (511, 0)]
     times = [one["time_usec"] for one in frames_of(tmp_path / "run.tlog", STATE)]
     assert 6 <= len(times) <= 10  # some 40 ticks of 4 ms, one in five
@@ -88,9 +88,7 @@ def test_a_peer_on_the_loops_link_asks_and_is_answered_there(clock: str, tmp_pat
     if clock == "lockstep":
         assert len(set(np.diff(times[1:]))) == 1
         assert counters["foreign"] == 0
-        assert (
-            len(frames_of(tmp_path / "run.tlog", mavlink_map.COMMAND_LONG)) == 4
-        )  # what was asked is in the record too
+        assert len(frames_of(tmp_path / "run.tlog", mapping.COMMAND_LONG)) == 4  # what was asked is in the record too
 
 
 def test_a_ground_station_asks_on_its_own_link_and_the_loops_link_carries_none_of_it(tmp_path: Path) -> None:
@@ -108,7 +106,7 @@ def test_a_ground_station_asks_on_its_own_link_and_the_loops_link_carries_none_o
     assert frames_of(tmp_path / "run.tlog", ODOMETRY) == []
     kept = frames_of(tmp_path / "station_emulator.tlog", ODOMETRY)
     assert [one["time_usec"] for one in kept] == watcher.times("ODOMETRY")
-    assert len(frames_of(tmp_path / "station_emulator.tlog", mavlink_map.COMMAND_LONG)) == 1
+    assert len(frames_of(tmp_path / "station_emulator.tlog", mapping.COMMAND_LONG)) == 1
     (answer,) = [one for one in watcher.heard if one.get_type() == "COMMAND_ACK"]
     assert (answer.command, answer.result) == (511, 0)
     assert ends.emulator["counters"]["sequence_gaps"] == 0

@@ -8,15 +8,15 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from bridge.endpoint import VEHICLE, Endpoint
-from bridge.memory import memory_pair
+from bridge.endpoint import Endpoint
+from bridge.links.memory import memory_pair
 from plant_emulator.emulator import Emulator
-from plant_emulator.truth import TruthWriter, load_truth
+from plant_emulator.plant.truth import TruthWriter, load_truth
 from protocol.errors import DivergenceError
-from protocol.mavlink_codec import FrameWriter
-from protocol.messages import ActuatorCommand
+from protocol.messages import VEHICLE, ActuatorCommand
 from protocol.scenario import Scenario
-from protocol.tick_frames import CommandWriter
+from protocol.wire.codec import FrameWriter
+from protocol.wire.tick_frames import CommandWriter
 from tests.loop import scenario_of
 
 FLAPPER = scenario_of("flapper", seed=3)

@@ -12,17 +12,19 @@ import pytest
 
 import controller.process as controller_process
 import plant_emulator.process
-from bridge.memory import memory_pair
+from bridge.links.memory import memory_pair
 from bridge.process import StopFlag
-from bridge.ring_recorder import RingRecorder
-from bridge.sidecar import read_sidecar
-from controller.laws import make_law
-from controller.process import ControllerOptions, serve
-from plant_emulator.process import EmulatorOptions, fly, warm_up
-from plant_emulator.truth import load_truth
+from bridge.recording.ring_recorder import RingRecorder
+from bridge.recording.sidecar import read_sidecar
+from controller.laws.law import make_law
+from controller.options import ControllerOptions
+from controller.process import serve
+from plant_emulator.options import EmulatorOptions
+from plant_emulator.plant.truth import load_truth
+from plant_emulator.process import fly, warm_up
 from protocol.errors import FwavHilError, RunFolderError
-from protocol.log_scan import scan_tlog
-from protocol.tlog import read_tlog
+from protocol.logs.scan import scan_tlog
+from protocol.logs.tlog import read_tlog
 from tests.loop import scenario_of
 
 SCENARIO = scenario_of("flapper", duration_s=8.0)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from protocol.can_frame import CanFrame, nominal_bits, worst_bits
-from protocol.can_stuffing import exact_bits
+from protocol.motors.can_stuffing import exact_bits
 
 FRAMES = st.one_of(
     st.builds(CanFrame, st.integers(0, (1 << 11) - 1), st.binary(max_size=8)),

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bridge.legs import (
+from bridge.latency.segments import (
     ANSWER_COLUMNS,
     CLOCK_COLUMNS,
     CONTROLLER_FILE,
@@ -17,7 +17,7 @@ from bridge.legs import (
     LegTable,
     save_legs,
 )
-from bridge.timesync import Estimate
+from bridge.timing.timesync import Estimate
 
 PERIOD_NS = 4_000_000
 START_NS = 10**13

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.legs import ANSWER_COLUMNS, CONTROLLER_FILE, EMULATOR_FILE, LegTable
-from bridge.timesync import Estimate
+from bridge.latency.segments import ANSWER_COLUMNS, CONTROLLER_FILE, EMULATOR_FILE, LegTable
+from bridge.timing.timesync import Estimate
 from fwav_hil.latency.analysis import LEGS, Legs, clock_check, join_legs, legs_of
 from protocol.errors import RunFolderError
 from tests.fwav_hil.latency.rows import (

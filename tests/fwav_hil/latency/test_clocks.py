@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.legs import Rows
+from bridge.latency.segments import Rows
 from fwav_hil.latency.clocks import MOST_DRIFT, offset_at
 
 S = 1_000_000_000

@@ -15,14 +15,14 @@ from typing import Any
 
 import pytest
 
-from bridge.clock import MonotonicClock
 from bridge.command_line import run_command
-from bridge.faults import DelayedLink
-from bridge.legs import CONTROLLER_FILE, EMULATOR_FILE, load_legs
-from bridge.link import open_link
-from bridge.memory import memory_pair
+from bridge.latency.responder import respond
+from bridge.latency.segments import CONTROLLER_FILE, EMULATOR_FILE, load_legs
+from bridge.links.faults import DelayedLink
+from bridge.links.link import open_link
+from bridge.links.memory import memory_pair
 from bridge.process import StopFlag
-from bridge.responder import respond
+from bridge.timing.clock import MonotonicClock
 from fwav_hil.cli import cli
 from fwav_hil.latency import study
 from fwav_hil.latency.analysis import LEGS, join_legs

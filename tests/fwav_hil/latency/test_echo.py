@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bridge.link import open_link
+from bridge.links.link import open_link
 from fwav_hil.latency.echo import COMMAND_BYTES, TICK_BYTES
 from fwav_hil.latency.peers import EMULATOR, _child
-from protocol import mavlink_map
-from protocol.mavlink_codec import FrameWriter
 from protocol.messages import ActuatorCommand
-from protocol.tick_frames import CommandWriter, TickWriter
+from protocol.wire import mapping
+from protocol.wire.codec import FrameWriter
+from protocol.wire.tick_frames import CommandWriter, TickWriter
 from tests.contracts.link_contract import receive
 from tests.loop import scenario_of
 
@@ -32,6 +32,6 @@ def test_the_sizes_are_those_of_a_tick_and_its_command() -> None:
     scale = np.array(scenario.actuators.scale)
     commands = CommandWriter(FrameWriter(1, 1), scale, lockstep=False)
     command = commands.frame(ActuatorCommand(4_000_000, 0.3 * scale, armed=True))
-    assert mavlink_map.COMMAND.message_id == 93
+    assert mapping.COMMAND.message_id == 93
     assert len(command) == COMMAND_BYTES
     assert sum(map(len, tick)) == TICK_BYTES

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bridge.clock import MonotonicClock
-from bridge.endpoint import VEHICLE, Endpoint
-from bridge.link import Link
-from bridge.memory import memory_pair
-from bridge.probes import ProbeResult
+from bridge.endpoint import Endpoint
+from bridge.latency.probes import ProbeResult
+from bridge.links.link import Link
+from bridge.links.memory import memory_pair
 from bridge.process import StopFlag
-from bridge.timesync import Estimate
+from bridge.timing.clock import MonotonicClock
+from bridge.timing.timesync import Estimate
 from fwav_hil.latency import peers
 from fwav_hil.latency.peers import (
     cyclictest,
@@ -29,9 +29,10 @@ from fwav_hil.latency.peers import (
     probe_responder,
     probe_time_sync,
 )
-from protocol import mavlink_map
 from protocol.errors import Interrupted, PeerMissingError
-from protocol.mavlink_codec import Frame
+from protocol.messages import VEHICLE
+from protocol.wire import mapping
+from protocol.wire.codec import Frame
 
 STATION = (255, 190)
 
@@ -74,10 +75,10 @@ def peer(answer: Callable[[Endpoint, Frame], list[bytes]]) -> Iterator[Link]:
 
 
 def reply(endpoint: Endpoint, frame: Frame, *, ahead_ns: int = 0, asked_ns: int | None = None) -> bytes:
-    _, ts1 = mavlink_map.decode_timesync(frame.payload)
+    _, ts1 = mapping.decode_timesync(frame.payload)
     told_ns = MonotonicClock().now_ns() + ahead_ns
-    payload = mavlink_map.encode_timesync(told_ns, ts1 if asked_ns is None else asked_ns)
-    return endpoint.seal(mavlink_map.TIMESYNC, payload)
+    payload = mapping.encode_timesync(told_ns, ts1 if asked_ns is None else asked_ns)
+    return endpoint.seal(mapping.TIMESYNC, payload)
 
 
 def ask(link: Link, count: int = 10) -> tuple[ProbeResult, Estimate | None]:
@@ -128,11 +129,11 @@ class TestTimeSync:
         heard: list[tuple[int, int]] = []
 
         def asking(endpoint: Endpoint, frame: Frame) -> list[bytes]:
-            told_ns, ts1 = mavlink_map.decode_timesync(frame.payload)
+            told_ns, ts1 = mapping.decode_timesync(frame.payload)
             if told_ns:
                 heard.append((frame.system, ts1))
                 return []
-            question = endpoint.seal(mavlink_map.TIMESYNC, mavlink_map.encode_timesync(0, 42))
+            question = endpoint.seal(mapping.TIMESYNC, mapping.encode_timesync(0, 42))
             return [question, b"\xfd noise", reply(endpoint, frame)]
 
         with peer(asking) as link:

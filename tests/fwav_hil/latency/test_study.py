@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from bridge.probes import ProbeResult
+from bridge.latency.probes import ProbeResult
 from bridge.process import StopFlag
-from bridge.timesync import Estimate
+from bridge.timing.timesync import Estimate
 from fwav_hil.latency import study
 from fwav_hil.latency.analysis import LEGS, Legs, legs_of
 from fwav_hil.latency.study import beside, leg_report, losses, prediction, report_of, summary_of, write_files

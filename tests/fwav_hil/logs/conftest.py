@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import all as widest
 
 from bridge.command_line import run_command
 from fwav_hil.cli import cli
-from tests.protocol.log_records import DAY_US, Record, mixed_records
+from tests.protocol.logs.log_records import DAY_US, Record, mixed_records
 
 COUNT = 50
 

@@ -12,11 +12,11 @@ from pymavlink.dialects.v20 import matrixpilot
 
 from fwav_hil.logs.choice import choose, choose_frames, log_file, names_in, open_telemetry, time_of_day
 from protocol.errors import LogError, UsageError
-from protocol.log_files import TELEMETRY, Log
-from protocol.log_scan import Scan, scan_tlog
-from protocol.mavlink_codec import FrameWriter, layout
-from tests.protocol.log_records import FOREIGN, Pen
-from tests.protocol.test_log_files import ardupilot_log
+from protocol.logs.files import TELEMETRY, Log
+from protocol.logs.scan import Scan, scan_tlog
+from protocol.wire.codec import FrameWriter, layout
+from tests.protocol.logs.log_records import FOREIGN, Pen
+from tests.protocol.logs.test_files import ardupilot_log
 
 DAY_US = 86_400_000_000
 BEGIN_US = 20_000 * DAY_US + (23 * 3600 + 59 * 60 + 58) * 1_000_000  # 23:59:58 UTC

@@ -12,7 +12,7 @@ import pytest
 
 import fwav_hil
 from tests.fwav_hil.logs.conftest import COUNT, Shell, flight
-from tests.protocol.log_records import DAY_US, FOREIGN
+from tests.protocol.logs.log_records import DAY_US, FOREIGN
 
 ROOT = Path(str(fwav_hil.__file__)).resolve().parent.parent
 

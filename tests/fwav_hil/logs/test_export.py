@@ -13,9 +13,9 @@ import pytest
 from mcap.reader import make_reader
 
 from fwav_hil.logs import export
-from protocol.log_files import open_log
+from protocol.logs.files import open_log
 from tests.fwav_hil.logs.conftest import COUNT, Shell, flight
-from tests.protocol.log_records import FOREIGN
+from tests.protocol.logs.log_records import FOREIGN
 
 NAMES = ["ATT_POS_MOCAP", "HIL_ACTUATOR_CONTROLS", "STATUSTEXT"]
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from bridge.recorder import Recorder
-from bridge.sidecar import LinkOfLog
+from bridge.recording.sidecar import LinkOfLog
+from bridge.recording.thread_recorder import Recorder
 from tests.fwav_hil.logs.conftest import COUNT, Shell, flight
-from tests.protocol.log_records import DAY_US, FOREIGN, Pen
+from tests.protocol.logs.log_records import DAY_US, FOREIGN, Pen
 
 
 def test_what_a_flight_holds(shell: Shell, flight_log: Path) -> None:

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from bridge.clock import MonotonicClock
 from bridge.command_line import run_command
+from bridge.timing.clock import MonotonicClock
 from fwav_hil.cli import cli
-from protocol.log_dialect import layouts
-from protocol.log_scan import Scan, scan_tlog
-from tests.bridge.test_recorder import wait_until
+from protocol.logs.dialect import layouts
+from protocol.logs.scan import Scan, scan_tlog
+from tests.bridge.recording.test_thread_recorder import wait_until
 from tests.fwav_hil.replay.conftest import run_folder
 from tests.fwav_hil.test_record import free_port
 

@@ -10,9 +10,9 @@ import pytest
 
 from fwav_hil.logs.choice import Choice
 from fwav_hil.logs.plot import lines_of
-from protocol.log_files import open_log
+from protocol.logs.files import open_log
 from tests.fwav_hil.logs.conftest import COUNT, Shell
-from tests.protocol.log_records import KNOWN, Pen
+from tests.protocol.logs.log_records import KNOWN, Pen
 
 TIMES = np.array([0.1 * row + (1.0 if row >= 30 else 0.0) for row in range(COUNT)])
 

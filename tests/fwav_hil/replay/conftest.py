@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from bridge.command_line import run_command
-from bridge.memory import memory_pair
+from bridge.links.memory import memory_pair
 from fwav_hil.cli import cli
 from tests.loop import fly_both, scenario_of
 

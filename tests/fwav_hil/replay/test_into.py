@@ -12,18 +12,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bridge.memory import memory_pair
+from bridge.links.memory import memory_pair
 from bridge.process import StopFlag
-from controller.laws import make_law
-from controller.process import ControllerOptions, serve
+from controller.laws.law import make_law
+from controller.options import ControllerOptions
+from controller.process import serve
 from fwav_hil.replay import into_controller, into_emulator
-from fwav_hil.replay.difference import Difference
-from fwav_hil.replay.recorded import Recorded, recorded_run
-from plant_emulator.process import EmulatorOptions, fly
-from protocol import mavlink_map
+from fwav_hil.replay.recorded_run import Recorded, recorded_run
+from fwav_hil.replay.replay_result import Difference
+from plant_emulator.options import EmulatorOptions
+from plant_emulator.process import fly
 from protocol.errors import LogError, PeerLostError, UsageError
-from protocol.mavlink_codec import FrameWriter
-from protocol.tlog import TlogWriter, read_tlog
+from protocol.logs.tlog import TlogWriter, read_tlog
+from protocol.wire import mapping
+from protocol.wire.codec import FrameWriter
 from tests.fwav_hil.replay.conftest import Command
 from tests.loop import fly_both, scenario_of
 
@@ -83,7 +85,7 @@ class TestEveryWay:
         self, way: Callable[[Recorded], Difference], run: Recorded, run_folder: Path, tmp_path: Path
     ) -> None:
         """Change what the way compares with, in the last tick, so that nothing is fed differently before it."""
-        wanted = mavlink_map.COMMAND if "command" in way(run).what else mavlink_map.POSE
+        wanted = mapping.COMMAND if "command" in way(run).what else mapping.POSE
         frames = [(t_us, frame) for t_us, frame in read_tlog(run_folder / "run.tlog")]
         last = max(k for k, (_, frame) in enumerate(frames) if frame.message_id == wanted.message_id)
         with TlogWriter(tmp_path / "run.tlog") as log:
@@ -93,7 +95,7 @@ class TestEveryWay:
                     writer = FrameWriter(frame.system, frame.component)
                     writer.sequence = frame.sequence
                     payload = bytearray(frame.payload)
-                    payload[28 if wanted is mavlink_map.POSE else 16] ^= 1
+                    payload[28 if wanted is mapping.POSE else 16] ^= 1
                     raw = writer.seal(wanted, bytes(payload))
                 log.write(t_us, raw)
         shutil.copy(run_folder / "scenario.toml", tmp_path)
@@ -128,8 +130,8 @@ class TestDifference:
         law = make_law(name, scenario)
         state, commands = law.start(), []
         for _, frame in read_tlog(run_folder / "run.tlog"):
-            if frame.message_id == mavlink_map.POSE.message_id:
-                sample = mavlink_map.decode_pose(frame.payload)
+            if frame.message_id == mapping.POSE.message_id:
+                sample = mapping.decode_pose(frame.payload)
                 assert sample is not None
                 commands.append(law.step(state, sample.t_ns, sample.q))
         return np.array(commands)
@@ -182,7 +184,7 @@ class TestTrouble:
 
     def test_a_log_without_samples_is_told(self, tmp_path: Path) -> None:
         with TlogWriter(tmp_path / "run.tlog") as log:
-            log.write(0, FrameWriter(1, 1).seal(mavlink_map.HEARTBEAT, b"\1"))
+            log.write(0, FrameWriter(1, 1).seal(mapping.HEARTBEAT, b"\1"))
         with pytest.raises(LogError, match="holds no sample"):
             recorded_run(tmp_path, "flapper", None)
 

@@ -16,18 +16,18 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common, matrixpilot
 
-from bridge.clock import VirtualClock
-from bridge.memory import memory_pair
+from bridge.links.memory import memory_pair
 from bridge.process import StopFlag
-from bridge.realtime import Setting
+from bridge.timing.clock import VirtualClock
+from bridge.timing.realtime import Setting
 from fwav_hil.logs.choice import Choice, choose_frames, open_telemetry
 from fwav_hil.replay.keyboard import Keyboard
 from fwav_hil.replay.to_link import Replay, ReplayOptions
-from protocol import mavlink_map
-from protocol.mavlink_codec import FrameReader
-from protocol.tlog import read_tlog
+from protocol.logs.tlog import read_tlog
+from protocol.wire import mapping
+from protocol.wire.codec import FrameReader
 from tests.fwav_hil.replay.conftest import Command
-from tests.protocol.log_records import CLASHING, FOREIGN, Pen
+from tests.protocol.logs.log_records import CLASHING, FOREIGN, Pen
 
 KEY = bytes(range(32))
 
@@ -80,7 +80,7 @@ class TestOverALink:
 
         monkeypatch.setattr(os, "sched_setscheduler", refuse)
         unlocked = Setting("memory locked", granted=False, said="not of a whole test run")
-        monkeypatch.setattr("bridge.realtime._lock_memory", lambda _: unlocked)
+        monkeypatch.setattr("bridge.timing.realtime._lock_memory", lambda _: unlocked)
         options = ("--from", "0.3", "--realtime", "--json", "-")
         assert fwav_hil("replay", run_folder, "--to", uri_of(listener), *options) == 0
         said = capsys.readouterr()
@@ -100,9 +100,9 @@ class TestOverALink:
         options = ("--from", "0.1", "--to", "0.2", "--types", "HIL_SENSOR,att_pos_mocap", "--system", "1/191")
         assert fwav_hil("replay", run_folder, "--to", uri_of(listener), "--speed", "max", *options) == 0
         frames = [frame for data in received(listener) for frame in FrameReader(is_datagram=True).read(data)]
-        ticks = [frame for frame in frames if frame.message_id == mavlink_map.TICK.message_id]
+        ticks = [frame for frame in frames if frame.message_id == mapping.TICK.message_id]
         assert len(frames) == 2 * len(ticks) == 52
-        times_ns = [mavlink_map.decode_tick_time_ns(frame.payload) for frame in ticks]
+        times_ns = [mapping.decode_tick_time_ns(frame.payload) for frame in ticks]
         assert (times_ns[0], times_ns[-1]) == (100_000_000, 200_000_000)
 
     def test_signed_anew_pymavlink_believes_it(
@@ -244,7 +244,7 @@ class TestLoop:
             replay.player.play = stop_after_three  # type: ignore[assignment, method-assign]
             result = replay.run()
             while data := far.recv(0.0):
-                times.append(mavlink_map.decode_tick_time_ns(data[10:-2]))
+                times.append(mapping.decode_tick_time_ns(data[10:-2]))
         assert result["passes"] >= 3
         assert len(times) >= 300
         assert (np.diff(times) > 0).all()

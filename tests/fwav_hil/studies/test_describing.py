@@ -20,7 +20,7 @@ from fwav_hil.studies.describing import (
 )
 from fwav_hil.studies.flight_check import at_rest
 from fwav_hil.studies.loop_model import channels
-from plant_emulator.backlash import BACKLASH, PLAY, gear_step
+from plant_emulator.plant.backlash import BACKLASH, PLAY, gear_step
 from protocol.messages import AXES
 from tests.loop import scenario_of
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bridge.command_line import run_command
-from controller.reference import reference_trajectory
+from controller.laws.reference import reference_trajectory
 from fwav_hil.cli import cli
 from fwav_hil.simulate import Simulation, simulate
 from fwav_hil.studies.lyapunov import lyapunov

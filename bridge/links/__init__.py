@@ -1,0 +1,1 @@
+"""Links: one end of a byte link each, the same face for every transport."""

@@ -1,0 +1,256 @@
+"""Link: one end of a byte link, the same face for every transport; and how a URI becomes one.
+
+    udpin://127.0.0.1:14560         waits for a peer          bridge/links/udp.py
+    udpout://127.0.0.1:14560        talks to one
+    tcpin://127.0.0.1:4560          waits for a client        bridge/links/tcp.py
+    tcpout://127.0.0.1:4560         connects to a server
+    serial:///dev/ttyUSB0:921600    a serial line             bridge/links/serial_port.py
+    mem://loop                      inside this process       bridge/links/memory.py
+
+A further transport is one file, one line in LINKS (and, where its URI has another shape, one in `parse_link_uri`), and
+a test class that inherits `tests.contracts.link_contract.LinkContract`.
+"""
+
+from __future__ import annotations
+
+import abc
+import importlib
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from types import MappingProxyType
+from typing import Final, Protocol, Self, cast
+
+from protocol.errors import LinkClosedError, LinkError, LinkUriError
+
+NOBODY: Final = "nobody yet"
+"""What `Link.peer` says before there is a peer."""
+
+SHORTEST_WAIT_S: Final = 1e-6
+"""A timeout below this (negative ones too) counts as 0."""
+
+
+@dataclass(slots=True)
+class LinkStats:
+    """What a link has counted since it was opened; bytes are those handed over, without the transport's headers."""
+
+    received: int = 0
+    """Datagrams or, on a stream, chunks handed to the caller."""
+    received_bytes: int = 0
+    sent: int = 0
+    """Sends the system took whole."""
+    sent_bytes: int = 0
+    unknown_peer: int = 0
+    """Datagrams dropped because they came from somebody who is not the peer."""
+    no_peer: int = 0
+    """Sends dropped because there is no peer yet."""
+    send_failed: int = 0
+    """Sends dropped because the system refused them: full buffer, too large, nobody listens there."""
+    refused: int = 0
+    """Times a receive learned that nobody listens at the peer's port (ECONNREFUSED)."""
+
+    def as_dict(self) -> dict[str, int]:
+        """Return the counters by name, for a summary."""
+        return asdict(self)
+
+
+class Link(abc.ABC):
+    """One end of a byte link.
+
+    A datagram link (`is_datagram`) keeps the bounds of what was sent: one `recv` returns what one `send` was given, or
+    nothing. A stream link returns chunks with arbitrary bounds. Neither waits without a bound. One thread receives and
+    one (the same or another) sends; `close` may come from any, and a `recv` under way then ends by its timeout at the
+    latest.
+
+    A link that wraps another gives its own `stats` and passes the rest on.
+    """
+
+    is_datagram: bool
+
+    spin_s: float = 0.0
+    """Poll for this long before sleeping in `recv`: a core kept busy for a quicker hand-over. UDP only; others ignore it."""
+
+    received_ns: int = 0
+    """When the kernel received what `recv` returned last, on `MonotonicClock`; 0 where that is not known."""
+
+    def __init__(self, uri: str) -> None:
+        """Set up what every link has; `uri` is how messages name the link."""
+        self.uri = uri
+        self.stats = LinkStats()
+        self._closed = False
+
+    @abc.abstractmethod
+    def recv(self, timeout_s: float) -> bytes | None:
+        """Return the next datagram or chunk, or None where nothing came within `timeout_s` (0 polls).
+
+        Raises:
+            LinkClosedError: this end was closed, or a stream's other end was and all it sent has been returned.
+            LinkError: the system reports that the link broke.
+        """
+
+    @abc.abstractmethod
+    def send(self, data: bytes | bytearray | memoryview) -> None:
+        """Send `data` as one datagram, or append it to the stream.
+
+        A datagram that cannot be sent at once is dropped whole and counted. A stream waits a bounded time for room.
+
+        Raises:
+            LinkClosedError: this end was closed, or a stream's other end was.
+            LinkError: a stream's other end took too little for too long.
+        """
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Let go of the port or device; calling it again does nothing."""
+
+    @property
+    @abc.abstractmethod
+    def peer(self) -> str:
+        """A name for the other end, for messages: "127.0.0.1:43210", or NOBODY."""
+
+    def stamp_receives(self) -> bool:
+        """Have `received_ns` told from now on; False where the transport or the system cannot.
+
+        Linux turns its stamps on a moment after it was asked to: until then the stamp is the time of the fetching.
+        """
+        return False
+
+    def counters(self) -> dict[str, int]:
+        """What the link has counted, by name."""
+        return self.stats.as_dict()
+
+    def release_peer(self) -> None:  # noqa: B027  (most links have nothing to release)
+        """Forget the peer, so that another may take its place; does nothing where the peer is fixed."""
+
+    def __enter__(self) -> Self:
+        """Return the link itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the link."""
+        self.close()
+
+    def _broken(self, cause: BaseException) -> LinkError:
+        """The error to raise for `cause`, met while using the link: closing it under a waiting thread ends here too."""
+        if self._closed:
+            return LinkClosedError(f"{self.uri} is closed on this end")
+        return LinkError(f"{self.uri} broke: {cause}")
+
+
+@dataclass(frozen=True, slots=True)
+class LinkUri:
+    """A link URI in its parts; a part that the scheme does not have is empty or 0."""
+
+    text: str
+    """The URI as it was written."""
+    scheme: str
+    host: str = ""
+    """IPv6 addresses stand here without their brackets."""
+    port: int = 0
+    """0 on a link that waits for its peer: the system chooses."""
+    path: str = ""
+    """The serial device."""
+    baud: int = 0
+    """Bits per second of the serial line."""
+    name: str = ""
+    """The name of the link inside the process."""
+
+
+class _Opener(Protocol):
+    def __call__(self, uri: LinkUri, *, connect_timeout_s: float) -> Link: ...
+
+
+LINKS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "udpin": "bridge.links.udp:UdpIn",
+        "udpout": "bridge.links.udp:UdpOut",
+        "tcpin": "bridge.links.tcp:TcpIn",
+        "tcpout": "bridge.links.tcp:TcpOut",
+        "serial": "bridge.links.serial_port:SerialLink",
+        "mem": "bridge.links.memory:open_memory",
+    }
+)
+"""Scheme -> "module:callable"; the callable takes a LinkUri and connect_timeout_s. Imported when first opened."""
+
+_DEFAULT_HOST = "127.0.0.1"  # never all interfaces unless asked: who reaches the port can move the vehicle
+_PROPOSED_PORT = {"udp": 14560, "tcp": 4560}
+_PROPOSED_SERIAL = "serial:///dev/ttyUSB0:921600"
+_HOST_AND_PORT = re.compile(r"(?:\[(?P<ipv6>[^\[\]\s]+)\]|(?P<host>[^\[\]:/@?#\s]*))(?::(?P<port>[^:]*))?")
+_LARGEST_PORT = 65535
+_LARGEST_PORT_DIGITS = 5
+
+
+def open_link(uri: str, *, connect_timeout_s: float = 10.0) -> Link:
+    """Open this process's end of the link that `uri` names; the caller closes it.
+
+    `connect_timeout_s` bounds the wait for a server at a `tcpout` address; no other link waits when it is opened.
+
+    Raises:
+        LinkUriError: the URI names no link.
+        LinkInUseError: the port, device or name is taken.
+        LinkError: no permission, no such device, no such host.
+        PeerMissingError: nothing listens at a `tcpout` address.
+    """
+    parsed = parse_link_uri(uri)
+    module, _, name = LINKS[parsed.scheme].partition(":")
+    opener = cast(_Opener, getattr(importlib.import_module(module), name))
+    return opener(parsed, connect_timeout_s=connect_timeout_s)
+
+
+def parse_link_uri(text: str) -> LinkUri:
+    """Take a link URI apart without opening anything.
+
+    Raises:
+        LinkUriError: the URI names no link; the message says why and shows one that does.
+    """
+    scheme, separator, rest = text.partition("://")
+    if not separator or scheme not in LINKS:
+        schemes = ", ".join(f"{known}://" for known in LINKS)
+        raise _bad(text, f"it must begin with one of {schemes}", f"udpin://{_DEFAULT_HOST}:{_PROPOSED_PORT['udp']}")
+    if scheme == "serial":
+        return _parse_serial(text, rest)
+    if scheme == "mem":
+        if not re.fullmatch(r"[\w.-]+", rest):
+            raise _bad(text, "the name must be of letters, digits, '.', '_' and '-'", "mem://loop")
+        return LinkUri(text, scheme, name=rest)
+    return _parse_network(text, scheme, rest)
+
+
+def _parse_serial(text: str, rest: str) -> LinkUri:
+    path, _, baud = rest.rpartition(":")  # the last colon: names under /dev/serial/by-path hold colons themselves
+    if not path.startswith("/"):
+        raise _bad(text, "it must name a device by its full path, then ':' and the baud rate", _PROPOSED_SERIAL)
+    if not _is_number(baud) or int(baud) == 0:
+        raise _bad(text, f"the baud rate {baud!r} is not a positive whole number", _PROPOSED_SERIAL)
+    return LinkUri(text, "serial", path=path, baud=int(baud))
+
+
+def _parse_network(text: str, scheme: str, rest: str) -> LinkUri:
+    proposed = _PROPOSED_PORT[scheme[:3]]
+    parts = _HOST_AND_PORT.fullmatch(rest)
+    if parts is None:
+        reason = "it must be a host, ':' and a port, an IPv6 address in brackets"
+        raise _bad(text, reason, f"{scheme}://{_DEFAULT_HOST}:{proposed} or {scheme}://[::1]:{proposed}")
+    host = parts["ipv6"] or parts["host"] or _DEFAULT_HOST
+    example = f"{scheme}://{join_address(host, proposed)}"
+    port = parts["port"]
+    if not port:
+        raise _bad(text, "the port is missing", example)
+    if not _is_number(port) or len(port) > _LARGEST_PORT_DIGITS or int(port) > _LARGEST_PORT:
+        raise _bad(text, f"the port {port!r} is not a whole number up to {_LARGEST_PORT}", example)
+    if int(port) == 0 and scheme.endswith("out"):
+        raise _bad(text, "port 0 (the system chooses) makes sense only where a link waits for its peer", example)
+    return LinkUri(text, scheme, host=host, port=int(port))
+
+
+def join_address(host: str, port: int) -> str:
+    """Return "host:port", an IPv6 address in brackets."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def _is_number(text: str) -> bool:
+    return text.isascii() and text.isdigit()
+
+
+def _bad(text: str, reason: str, example: str) -> LinkUriError:
+    return LinkUriError(f"{text!r} names no link: {reason}; write for example {example}")

@@ -1,0 +1,236 @@
+"""UDP: UdpIn waits on a port and answers whoever writes first; UdpOut talks to one address.
+
+How they wait. A round trip inside one machine takes some ten microseconds, so each system call counts. A timeout of
+8 ms or more first blocks in the receive itself (one call), under a kernel timer (SO_RCVTIMEO) set once, at opening.
+That timer counts in jiffies: asked for one, it takes one to two, which is up to 8 ms at CONFIG_HZ=250 (2 ms at 1000,
+20 ms at 100). What remains after it, and every shorter timeout, is waited for with select: exact to the scheduler's
+delay, for one call more. So no timeout is late by a jiffy (but one of 8 to 20 ms at CONFIG_HZ=100), and none costs a
+setsockopt.
+
+Signals. Python runs its handler at once and then starts the interrupted receive over. A handler that only sets a flag
+delays the end of `recv` by 8 ms at most. A signal that comes more often than that, for long, would hold off the end of
+a wait of 8 ms or more for as long; data still ends it at once.
+
+Python's own socket timeout (settimeout) would poll before every receive and count in whole milliseconds.
+"""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+import select
+import socket
+import struct
+import sys
+from typing import Final
+
+from bridge.links.addresses import Address, cannot_bind, name_of, new_socket, resolve
+from bridge.links.link import NOBODY, SHORTEST_WAIT_S, Link, LinkUri, join_address
+from bridge.timing.clock import MonotonicClock, unix_offset_ns
+from protocol.errors import LinkClosedError, LinkError
+
+LARGEST_DATAGRAM_BYTES: Final = 65535
+WANTED_BUFFER_BYTES: Final = 1 << 20
+
+_BLOCKING_WAIT_S = 0.008
+_ONE_JIFFY = struct.pack("@ll", 0, 1000)  # struct timeval of 1 ms; the kernel rounds up to a jiffy
+_SO_TIMESTAMPNS = 35  # as option and as type of the control message; not among Python's names
+_TIMESPEC = struct.Struct("@ll")
+_STAMP_SPACE = socket.CMSG_SPACE(_TIMESPEC.size)
+_DROPS_PER_RECV = 1000  # strangers' datagrams that one recv clears away once its time is up; the next goes on
+
+
+class _UdpLink(Link):
+    is_datagram = True
+
+    def __init__(self, uri: LinkUri, family: socket.AddressFamily) -> None:
+        super().__init__(uri.text)
+        self._clock = MonotonicClock()
+        self._socket = new_socket(uri, family, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _ONE_JIFFY)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WANTED_BUFFER_BYTES)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WANTED_BUFFER_BYTES)
+        self._is_stamped = False
+        self.receive_buffer_bytes = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+        """What the system granted of WANTED_BUFFER_BYTES; Linux reports twice what it counts as payload."""
+
+    def stamp_receives(self) -> bool:
+        """Ask for SO_TIMESTAMPNS (Linux). See `Link.stamp_receives`."""
+        if sys.platform == "linux":
+            with contextlib.suppress(OSError):  # a system that imitates Linux without it
+                self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+                self._is_stamped = True
+        return self._is_stamped
+
+    def _receive_stamped(self, flags: int) -> tuple[bytes, Address]:
+        """A datagram and its sender, the kernel's stamp of it noted."""
+        data, ancillary, _, sender = self._socket.recvmsg(LARGEST_DATAGRAM_BYTES, _STAMP_SPACE, flags)
+        self.received_ns = 0
+        for level, kind, value in ancillary:
+            if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS:
+                seconds, nanoseconds = _TIMESPEC.unpack(value)
+                self.received_ns = seconds * 1_000_000_000 + nanoseconds - unix_offset_ns()
+        return data, sender
+
+    @abc.abstractmethod
+    def _take(self, flags: int) -> bytes | None:
+        """One receive: a datagram of the peer, or None where what came was none and has been counted."""
+
+    def recv(self, timeout_s: float) -> bytes | None:
+        """Return the next datagram of the peer, or None; see `Link.recv`."""
+        started_ns = self._clock.now_ns()
+        remaining_s = timeout_s
+        dropped = 0
+        spin_until_ns = started_ns + round(min(self.spin_s, timeout_s) * 1e9) if self.spin_s else 0
+        while spin_until_ns:
+            try:
+                data = self._take(socket.MSG_DONTWAIT)
+                if data is not None:
+                    return self._count_received(data)
+            except BlockingIOError:
+                pass
+            except OSError as error:
+                raise self._broken(error) from error
+            now_ns = self._clock.now_ns()
+            if now_ns > spin_until_ns:
+                remaining_s = timeout_s - (now_ns - started_ns) * 1e-9
+                break
+        while True:
+            blocking = remaining_s >= _BLOCKING_WAIT_S
+            try:
+                data = self._take(0 if blocking else socket.MSG_DONTWAIT)
+                if data is not None:
+                    return self._count_received(data)
+                dropped += 1
+            except BlockingIOError:
+                if not blocking:
+                    if remaining_s < SHORTEST_WAIT_S:
+                        return None
+                    self._wait_readable(remaining_s)
+            except OSError as error:
+                raise self._broken(error) from error
+            remaining_s = timeout_s - (self._clock.now_ns() - started_ns) * 1e-9
+            if dropped > _DROPS_PER_RECV and remaining_s <= 0:
+                return None
+
+    def _wait_readable(self, timeout_s: float) -> None:
+        try:
+            select.select((self._socket,), (), (), timeout_s)
+        except (OSError, ValueError) as error:  # closed by another thread
+            raise self._broken(error) from error
+
+    def close(self) -> None:
+        """Let go of the port."""
+        self._closed = True
+        self._socket.close()
+
+    def _count_received(self, data: bytes) -> bytes:
+        self.stats.received += 1
+        self.stats.received_bytes += len(data)
+        return data
+
+    def _count_send(self, size: int) -> None:
+        self.stats.sent += 1
+        self.stats.sent_bytes += size
+
+    def _count_failed_send(self, error: OSError) -> None:
+        if self._closed:
+            raise self._broken(error) from error
+        self.stats.send_failed += 1
+
+
+class UdpIn(_UdpLink):
+    """Waits on a port; the sender of the first datagram is the peer until `release_peer`, and others are dropped.
+
+    `port` is the port it waits on, also where the URI said 0.
+
+    Raises LinkInUseError where the port is taken, LinkError where the address is not this machine's or not allowed.
+    """
+
+    def __init__(self, uri: LinkUri, *, connect_timeout_s: float = 0.0) -> None:
+        """Bind the port; `connect_timeout_s` is every link's and has no meaning here."""
+        family, address = resolve(uri, socket.SOCK_DGRAM)
+        super().__init__(uri, family)
+        self._peer: Address | None = None
+        try:
+            self._socket.bind(address)  # without SO_REUSEADDR: two simulations on one port must not go unnoticed
+        except OSError as error:
+            self.close()
+            raise cannot_bind(uri, error) from error
+        self.port: int = self._socket.getsockname()[1]
+        self.uri = f"{uri.scheme}://{join_address(uri.host, self.port)}"
+
+    def _take(self, flags: int) -> bytes | None:
+        if self._is_stamped:
+            data, sender = self._receive_stamped(flags)
+        else:
+            data, sender = self._socket.recvfrom(LARGEST_DATAGRAM_BYTES, flags)
+        if sender != self._peer:
+            if self._peer is not None:
+                self.stats.unknown_peer += 1
+                return None
+            self._peer = sender
+        return data
+
+    def send(self, data: bytes | bytearray | memoryview) -> None:
+        """Send to the peer; without one the datagram is dropped and counted. See `Link.send`."""
+        if self._peer is None:
+            if self._closed:
+                raise LinkClosedError(f"{self.uri} is closed on this end")
+            self.stats.no_peer += 1
+            return
+        try:
+            self._count_send(self._socket.sendto(data, socket.MSG_DONTWAIT, self._peer))
+        except OSError as error:
+            self._count_failed_send(error)
+
+    def release_peer(self) -> None:
+        """Forget the peer: the next to send a datagram takes its place."""
+        self._peer = None
+
+    @property
+    def peer(self) -> str:
+        """The peer as "host:port", or NOBODY."""
+        return NOBODY if self._peer is None else name_of(self._peer)
+
+
+class UdpOut(_UdpLink):
+    """Talks to one address; what others send does not reach it (the kernel filters, uncounted).
+
+    While nobody listens there, the system says so once per datagram that was sent: `refused` where a receive meets the
+    answer, `send_failed` where the next send does, which drops that datagram.
+
+    Raises LinkError where the host cannot be resolved or reached.
+    """
+
+    def __init__(self, uri: LinkUri, *, connect_timeout_s: float = 0.0) -> None:
+        """Choose the address, without a word to it; `connect_timeout_s` is every link's and has no meaning here."""
+        family, address = resolve(uri, socket.SOCK_DGRAM)
+        super().__init__(uri, family)
+        self._peer = name_of(address)
+        try:
+            self._socket.connect(address)
+        except OSError as error:
+            self.close()
+            raise LinkError(f"{uri.text}: cannot reach {self._peer} ({error}): correct the address") from error
+
+    def _take(self, flags: int) -> bytes | None:
+        try:
+            if self._is_stamped:
+                return self._receive_stamped(flags)[0]
+            return self._socket.recv(LARGEST_DATAGRAM_BYTES, flags)
+        except ConnectionRefusedError:
+            self.stats.refused += 1
+            return None
+
+    def send(self, data: bytes | bytearray | memoryview) -> None:
+        """Send to the address. See `Link.send`."""
+        try:
+            self._count_send(self._socket.send(data, socket.MSG_DONTWAIT))
+        except OSError as error:
+            self._count_failed_send(error)
+
+    @property
+    def peer(self) -> str:
+        """The address as "host:port"."""
+        return self._peer

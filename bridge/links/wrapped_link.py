@@ -1,0 +1,46 @@
+"""What every link that wraps another passes on as it is."""
+
+from __future__ import annotations
+
+from bridge.links.link import Link
+
+
+class WrappedLink(Link):
+    """A link in front of another one: `recv` is its own, the rest is that link's until it says otherwise."""
+
+    def __init__(self, link: Link) -> None:
+        super().__init__(link.uri)
+        self.is_datagram = link.is_datagram
+        self.stats = link.stats
+        self._link = link
+
+    @property
+    def spin_s(self) -> float:
+        """The link's."""
+        return self._link.spin_s
+
+    @spin_s.setter
+    def spin_s(self, value: float) -> None:
+        self._link.spin_s = value
+
+    def send(self, data: bytes | bytearray | memoryview) -> None:
+        """Send at once."""
+        self._link.send(data)
+
+    def stamp_receives(self) -> bool:
+        """As the link does."""
+        return self._link.stamp_receives()
+
+    def close(self) -> None:
+        """Close the link; what is on its way is lost."""
+        self._closed = True
+        self._link.close()
+
+    @property
+    def peer(self) -> str:
+        """The link's."""
+        return self._link.peer
+
+    def release_peer(self) -> None:
+        """As the link does."""
+        self._link.release_peer()

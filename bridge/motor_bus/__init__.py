@@ -1,0 +1,1 @@
+"""The CAN bus of the motor drives."""

@@ -1,0 +1,1 @@
+"""Time: the clock, fixed rates, real-time settings, time synchronisation."""

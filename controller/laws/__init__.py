@@ -1,0 +1,1 @@
+"""Control laws and the reference that they follow."""

@@ -1,0 +1,320 @@
+"""The one stepping function of every control law, and its state.
+
+Between its inputs and tau each law is linear: per axis a discrete state space, computed once from its equations and its
+sampling period by the law's own file (`ude`, `pd`, `dob`):
+
+    tau_k    = C x_k + D r_k + bias          r = [q, q_e, q_d'', q', q_e']   (the last two for state feedback only)
+    x_(k+1)  = A x_k + B r_k + B_tau tau_applied_k
+    uhat_k   = C_u x_k + D_u r_k             the estimate of u_d, for the log and for taking up again after a gap
+
+then the rotation of the force into the body, the limits, float32 as on the wire, and the value so applied rotated back
+into the observer: that is the anti-windup. The HIL process, the in-process simulation and the margin study all use this
+object. x[0], what happens at the start and after missing samples: see `_start_axis` and `control_step`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from controller.laws.reference import ReferenceParameters, evaluate_reference, reference_parameters
+from controller.laws.registry import law_entry, make_realisation, velocity_sentence
+from controller.laws.state_space import INPUTS, Realisation
+from protocol.compiled import Packed, compiled, pack, views
+from protocol.errors import UsageError
+from protocol.messages import FloatArray
+from protocol.rotations import rotate_to_body, rotate_to_inertial, unwrap_angle, wrap_angle
+from protocol.scenario import Actuators, Scenario
+from protocol.wire.mapping import command_from_wire, command_to_wire
+
+
+class Output(NamedTuple):
+    """What happens between the linear law and the wire: limits and scale (6,), body frame; rotation on or off."""
+
+    lower: FloatArray
+    upper: FloatArray
+    scale: FloatArray
+    rotate_force: bool
+
+
+class LawState(NamedTuple):
+    """All that a law remembers, changed in place.
+
+    x         (6, n)  states of the realisation
+    q         (6,)    last measured position and attitude, angles unwrapped
+    applied   (6,)    tau applied last, inertial frame
+    uhat      (6,)    last estimate
+    tau       (6,)    last command, body frame, exactly as the wire carries it
+    desired   (3, 6)  q_d, q_d', q_d'' at the last sample
+    t_ns      (1,)    the law's own time: that of the first sample and whole periods since
+    fresh     (1,)    not zero: the next sample starts the law
+    counts    (4,)    STEPS, MISSED, RESTARTS, SATURATED
+    r         (6, INPUTS)  inputs of the last step
+    scratch   (3, 6)
+    packed    all of the above as one structure (the arrays above share its memory), for calls from Python
+    """
+
+    x: FloatArray
+    q: FloatArray
+    applied: FloatArray
+    uhat: FloatArray
+    tau: FloatArray
+    desired: FloatArray
+    t_ns: npt.NDArray[np.int64]
+    fresh: npt.NDArray[np.int64]
+    counts: npt.NDArray[np.int64]
+    r: FloatArray
+    scratch: FloatArray
+    packed: Packed
+
+
+STEPS, MISSED, RESTARTS, SATURATED = range(4)
+COUNTS = ("steps", "missed_samples", "restarts", "saturated")
+
+
+@compiled
+def _inputs(q: FloatArray, velocity: FloatArray, desired: FloatArray, r: FloatArray) -> None:
+    """Fill r (6, INPUTS); the error of an angle is wrapped to +-pi."""
+    for axis in range(6):
+        error = q[axis] - desired[0, axis]
+        if axis >= 3:
+            error = wrap_angle(error)
+        r[axis, 0] = q[axis]
+        r[axis, 1] = error
+        r[axis, 2] = desired[2, axis]
+        r[axis, 3] = velocity[axis]
+        r[axis, 4] = velocity[axis] - desired[1, axis]
+
+
+@compiled
+def _start_axis(axis: int, law: Realisation, state: LawState, uhat: float) -> None:
+    """x_0: the observer at rest at q_0 with the estimate uhat, the differentiator at rest."""
+    for i in range(state.x.shape[1]):
+        x = law.start_u[axis, i] * uhat
+        for j in range(INPUTS):
+            x += law.start_r[axis, i, j] * state.r[axis, j]
+        state.x[axis, i] = x
+
+
+@compiled
+def _advance(law: Realisation, state: LawState) -> None:
+    """x_(k+1) from x_k, in place."""
+    order = state.x.shape[1]
+    following = state.scratch[2]
+    for axis in range(6):
+        for i in range(order):
+            x = law.B_tau[axis, i] * state.applied[axis]
+            for j in range(order):
+                x += law.A[axis, i, j] * state.x[axis, j]
+            for j in range(INPUTS):
+                x += law.B[axis, i, j] * state.r[axis, j]
+            following[i] = x
+        for i in range(order):
+            state.x[axis, i] = following[i]
+
+
+@compiled
+def _catch_up(
+    periods: int,
+    period_ns: int,
+    law: Realisation,
+    reference: ReferenceParameters,
+    state: LawState,
+    q: FloatArray,
+    velocity: FloatArray,
+) -> None:
+    """Step through the periods of which no sample came: q linear between its neighbours, tau held."""
+    between = state.scratch[1]
+    for missing in range(1, periods):
+        t_ns = state.t_ns[0] + missing * period_ns
+        evaluate_reference(t_ns * 1e-9, reference, state.desired[0], state.desired[1], state.desired[2])
+        for axis in range(6):
+            between[axis] = state.q[axis] + (q[axis] - state.q[axis]) * (missing / periods)
+        _inputs(between, velocity, state.desired, state.r)
+        _advance(law, state)
+
+
+@compiled
+def control_step(
+    law: Realisation,
+    output: Output,
+    reference: ReferenceParameters,
+    period_ns: int,
+    state: LawState,
+    t_ns: int,
+    measured: FloatArray,
+    velocity: FloatArray,
+) -> None:
+    """One step of the law on the sample `measured` (6,) of time t_ns; the command is then in state.tau (6,).
+
+    Periods without a sample since the last step are stepped all at once (q linear, tau held); after a gap of an axis's
+    memory_s or more that axis starts again from its last estimate. Periods are counted from the first sample on: one that
+    comes before the next of them is due by half changes nothing, the command stands. `velocity` (6,) is read by
+    state-feedback laws only.
+    """
+    q, r = state.scratch[0], state.r
+    first = state.fresh[0] != 0
+    periods = 1
+    for i in range(3):
+        q[i] = measured[i]
+        q[3 + i] = measured[3 + i] if first else unwrap_angle(measured[3 + i], state.q[3 + i])
+    if not first:
+        periods = (t_ns - state.t_ns[0] + period_ns // 2) // period_ns
+        if periods < 1:
+            return
+        if periods > 1:
+            state.counts[1] += periods - 1
+            if periods * period_ns * 1e-9 < law.memory_s.max():
+                _catch_up(periods, period_ns, law, reference, state, q, velocity)
+
+    evaluate_reference(t_ns * 1e-9, reference, state.desired[0], state.desired[1], state.desired[2])
+    gap_s = periods * period_ns * 1e-9
+    restarted = False
+    _inputs(q, velocity, state.desired, r)
+    for axis in range(6):
+        if first:
+            _start_axis(axis, law, state, law.uhat0[axis])
+        elif periods > 1 and gap_s >= law.memory_s[axis]:
+            _start_axis(axis, law, state, state.uhat[axis])
+            restarted = True
+        uhat = 0.0
+        tau = law.bias[axis]
+        for i in range(state.x.shape[1]):
+            uhat += law.C_u[axis, i] * state.x[axis, i]
+            tau += law.C[axis, i] * state.x[axis, i]
+        for j in range(INPUTS):
+            uhat += law.D_u[axis, j] * r[axis, j]
+            tau += law.D[axis, j] * r[axis, j]
+        state.uhat[axis] = uhat
+        state.tau[axis] = tau
+    if restarted:
+        state.counts[2] += 1
+
+    tau = state.tau
+    alpha, beta, gamma = measured[3], measured[4], measured[5]
+    if output.rotate_force:
+        tau[0], tau[1], tau[2] = rotate_to_body(alpha, beta, gamma, tau[0], tau[1], tau[2])
+    saturated = False
+    for axis in range(6):
+        allowed = min(max(tau[axis], output.lower[axis]), output.upper[axis])
+        saturated = saturated or allowed != tau[axis]
+        tau[axis] = command_from_wire(command_to_wire(allowed, output.scale[axis]), output.scale[axis])
+        state.applied[axis] = tau[axis]
+    if saturated:
+        state.counts[3] += 1
+    if output.rotate_force:
+        state.applied[0], state.applied[1], state.applied[2] = rotate_to_inertial(
+            alpha, beta, gamma, tau[0], tau[1], tau[2]
+        )
+
+    _advance(law, state)
+    for axis in range(6):
+        state.q[axis] = q[axis]
+    state.t_ns[0] = t_ns if first else state.t_ns[0] + periods * period_ns
+    state.fresh[0] = 0
+    state.counts[0] += 1
+
+
+@compiled
+def packed_control_step(law: Packed, state: Packed, t_ns: int, measured: FloatArray, velocity: FloatArray) -> None:
+    """`control_step` on packed structures: `Law.packed` and `LawState.packed`."""
+    data = law[0]
+    control_step(data, data, data, data.period_ns, state[0], t_ns, measured, velocity)
+
+
+class Law:
+    """A control law ready to run: data plus one step function.
+
+    name            as in the registry (`controller.laws.registry`)
+    needs_velocity  state feedback: it exists in the in-process simulation only
+    realisation, output, reference, period_ns: what `control_step` takes; packed: all four as one structure
+    """
+
+    def __init__(
+        self, name: str, scenario: Scenario, realisation: Realisation, *, needs_velocity: bool = False
+    ) -> None:
+        self.name = name
+        self.needs_velocity = needs_velocity
+        self.realisation = realisation
+        self.output = output_of(scenario.actuators, rotate_force=scenario.control.rotate_force)
+        self.reference = reference_parameters(scenario.reference)
+        self.period_ns = scenario.period_ns
+        self.packed = pack(
+            {
+                **realisation._asdict(),
+                **self.output._asdict(),
+                **self.reference._asdict(),
+                "period_ns": self.period_ns,
+            }
+        )
+
+    def start(self) -> LawState:
+        """The state before the first sample."""
+        order = self.realisation.A.shape[1]
+        packed = pack(
+            {
+                "x": np.zeros((6, order)),
+                "q": np.zeros(6),
+                "applied": np.zeros(6),
+                "uhat": np.zeros(6),
+                "tau": np.zeros(6),
+                "desired": np.zeros((3, 6)),
+                "t_ns": np.zeros(1, dtype=np.int64),
+                "fresh": np.ones(1, dtype=np.int64),
+                "counts": np.zeros(len(COUNTS), dtype=np.int64),
+                "r": np.zeros((6, INPUTS)),
+                "scratch": np.zeros((3, max(6, order))),
+            }
+        )
+        return LawState(**views(packed), packed=packed)
+
+    def step(self, state: LawState, t_ns: int, q: FloatArray, q_dot: FloatArray | None = None) -> FloatArray:
+        """tau (6,) in the body frame for the sample q (6,) of time t_ns; a copy, to keep.
+
+        Raises UsageError where the law needs the velocity q_dot (6,) and there is none.
+        """
+        if q_dot is None:
+            if self.needs_velocity:
+                raise UsageError(velocity_sentence(self.name))
+            q_dot = _NO_VELOCITY
+        packed_control_step(self.packed, state.packed, t_ns, q, q_dot)
+        return state.tau.copy()
+
+    def adopt(self, other: Law) -> None:
+        """Take over another's gains, in place: whoever steps this law steps them from now on; then `restart`.
+
+        Raises UsageError, with nothing changed, where the other law is of another form, or its gains are too far out for
+        finite matrices.
+        """
+        if other.packed.dtype != self.packed.dtype or not all(np.isfinite(part).all() for part in other.realisation):
+            raise UsageError(f"the law '{other.name}' with these gains cannot take the place of '{self.name}'")
+        self.realisation, self.output = other.realisation, other.output
+        self.packed[...] = other.packed
+
+    @staticmethod
+    def restart(state: LawState) -> None:
+        """Let the next sample start the law as its first did; what was counted stays."""
+        state.fresh[0] = 1
+
+    @staticmethod
+    def counts(state: LawState) -> dict[str, int]:
+        """What the law has counted so far, by name."""
+        return dict(zip(COUNTS, state.counts.tolist(), strict=True))
+
+
+def make_law(name: str, scenario: Scenario) -> Law:
+    """The law called `name` for the scenario's gains and rate.
+
+    Raises UsageError for a name there is not, ScenarioError where the scenario's filter is none for that law.
+    """
+    return Law(name, scenario, make_realisation(name, scenario), needs_velocity=law_entry(name).needs_velocity)
+
+
+_NO_VELOCITY = np.zeros(6)
+
+
+def output_of(actuators: Actuators, *, rotate_force: bool) -> Output:
+    """Limits and scales of a scenario as the kernel takes them."""
+    return Output(np.array(actuators.lower), np.array(actuators.upper), np.array(actuators.scale), rotate_force)

@@ -1,0 +1,1 @@
+"""Where pose samples come from."""

@@ -1,0 +1,1 @@
+"""The controller towards a ground station."""

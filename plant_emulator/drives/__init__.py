@@ -1,0 +1,1 @@
+"""Motor drives behind a CAN bus."""

@@ -1,0 +1,345 @@
+"""The emulator's end of the motor bus: torques out as CAN frames, the force behind the gears back.
+
+Each command goes out as the protocol's frames, then a SYNC that gives the drives the time; six answers bring u. Waiting for
+them follows the `exact` rule: in lockstep the same bytes again after 10, 20, 40 ms ..., and nothing moves meanwhile. After
+2 s of wall time the drives are taken for gone: an outage, counted; the plant then gets the safe output, and goes on at the
+pace of wall time, looking for answers. Drives that come back are enabled again. 10 s without them disarm and end the run.
+
+In real time an answer is waited for shortly, and the last u is held; after `actuators.staleness_s` without answers the
+outage begins.
+
+feedback "bus" takes u from the protocol's own status frames, where they carry the position of the output shaft, as it was
+when they were sent: what an encoder behind the gear would give. In real time there is then no SYNC at all, as on hardware.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from bridge.motor_bus.can_bus import CanBus
+from bridge.motor_bus.can_load import BusPlan, response_ns
+from bridge.process import StopFlag
+from bridge.reporting import Report
+from bridge.timing.clock import Clock
+from protocol.can_frame import CanFrame
+from protocol.errors import (
+    FwavHilError,
+    LinkInUseError,
+    PeerLostError,
+    PeerMissingError,
+    ScenarioMismatchError,
+    UsageError,
+)
+from protocol.messages import FloatArray
+from protocol.motors import simulation_sync
+from protocol.motors.can_stuffing import exact_bits
+from protocol.motors.motor_protocol import CAUSES, DRIVES, Cause, Status, make_host
+from protocol.motors.simulation_sync import ALL_AXES, TICKS
+from protocol.scenario import NANOSECONDS, Scenario
+from protocol.wire.streams import Due
+
+ENABLE_AGAIN_NS = NANOSECONDS // 10
+"""Of simulation time, between two tries to enable drives that are not."""
+GIVE_UP_NS = 10 * NANOSECONDS
+"""Of wall time: an outage this long ends the run."""
+HELLO_S = 0.1
+SHORT_WAIT_S = 0.002
+
+RESEND_AFTER_S = (0.010, 0.020, 0.040, 0.080, 0.160, 0.320, 0.640, 0.730)
+"""Waits of the exact rule, as in `pacing`: after each the frames are sent again; after the last, 2 s in all, an outage."""
+
+Watch = Callable[[int, CanFrame], None]
+"""Is told of each frame on the bus and the time (ns) it belongs to: a recorder, the tap."""
+
+
+class CanMotors:
+    """Six drives behind a bus, for the emulator.
+
+    counters   motor_resent        commands sent again because not all drives had answered
+               motor_outages       times the drives were gone           motor_outage_ticks   ticks without them
+               motor_recoveries    times all of them followed again     motor_safe_ticks     ticks with a drive not enabled
+               motor_enables       times the drives were told to follow torques
+               motor_late_answers  answers to an earlier tick, and copies
+               motor_faults        status frames that report a latched fault
+               bus_bits            bits of all frames but those of the simulation, their stuffing counted
+               and those of the bus and of `motor_protocol.Cause`
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        bus: CanBus,
+        plan: BusPlan,
+        *,
+        lockstep: bool,
+        feedback: str,
+        clock: Clock,
+        stop: StopFlag,
+        report: Report,
+        waits_s: tuple[float, ...] = RESEND_AFTER_S,
+    ) -> None:
+        self._scenario = scenario
+        self._bus = bus
+        self._plan = plan
+        self._lockstep = lockstep
+        self._from_bus = feedback == "bus"
+        if self._from_bus and plan.protocol == "dronecan":
+            raise UsageError("--feedback bus: DroneCAN's esc.Status carries no position; use --protocol odrive or mit")
+        self._syncs = lockstep or not self._from_bus
+        self._clock = clock
+        self._stop = stop
+        self._report = report
+        self._waits_s = waits_s
+        self._host = make_host(plan.protocol, scenario.motor)
+        self.watches: list[Watch] = []
+        self.poll: list[Callable[[], None]] = []
+        self.tap_counters: dict[str, int] = {}
+        self._now_ns = 0
+        self.delay_ns = response_ns(plan) if scenario.motor.bus_delay else 0
+        self._scale = np.array(scenario.actuators.scale)
+        h = np.array(scenario.hysteresis.h)
+        self._safe_u = h * np.array(scenario.actuators.safe)
+        self._u: FloatArray = h * np.array(scenario.initial.command)
+        self._bus_u = self._u.copy()
+        self._heard = 0
+        self._all_enabled = False
+        self._enabled = 0
+        self._enable_ns: int | None = None
+        self._answered_ns = 0
+        self._out_ns: int | None = None
+        self._recovering = False
+        self._begun = False
+        self._tau = np.array(scenario.initial.command)
+        self.velocities: FloatArray = np.zeros(DRIVES)
+        """(6,) how fast the drives said that they turn, rad/s."""
+        self._coming: deque[tuple[int, FloatArray]] = deque()
+        names = ("resent", "outages", "outage_ticks", "recoveries", "safe_ticks", "enables", "late_answers", "faults")
+        self._counters = {
+            **dict.fromkeys((f"motor_{name}" for name in names), 0),
+            "bus_bits": 0,
+            **dict.fromkeys(CAUSES, 0),
+        }
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Everything counted, by name."""
+        return {**self._counters, **self._bus.counters, **self.tap_counters}
+
+    def inject(self, frames: list[CanFrame]) -> None:
+        """Put frames of somebody else, a station on the tap, on the bus."""
+        for frame in frames:
+            self._bus.send(frame)
+            self._note(self._now_ns, frame)
+
+    def summary(self, duration_s: float) -> dict[str, Any]:
+        """What a run's summary says of the bus: loads planned, and measured over the simulated (or real) duration_s."""
+        bits = self._counters["bus_bits"] / duration_s if duration_s else 0.0
+        measured = {str(bitrate): 100.0 * bits / bitrate for bitrate in self._plan.loads}
+        return {"uri": self._bus.uri.text, **self._plan.as_dict(), "measured_load_percent": measured}
+
+    def meet(self, wait_s: float) -> None:
+        """Wait for the drives. Raises PeerMissingError, ScenarioMismatchError, LinkInUseError."""
+        digest = self._scenario.drive_digest()
+        give_up_ns = self._clock.now_ns() + round(wait_s * NANOSECONDS)
+        due = Due(1.0 / HELLO_S)
+        seen = 0
+        while (now_ns := self._clock.now_ns()) < give_up_ns:
+            self._stop.check()
+            if due.at(now_ns):
+                hello = [simulation_sync.encode_hello(digest, drives=False)] if self._syncs else self._host.disable()
+                for frame in hello:
+                    self._bus.send(frame)
+            received = self._bus.recv(HELLO_S)
+            if received is None:
+                continue
+            if simulation_sync.decode_sync(received) or simulation_sync.decode_hello(received, drives=False):
+                raise LinkInUseError(
+                    f"another emulator commands the drives on {self._bus.uri.text}: choose another bus with --can"
+                )
+            theirs = simulation_sync.decode_hello(received, drives=True)
+            if theirs is not None and theirs != digest:
+                raise ScenarioMismatchError(
+                    f"the drives hold another scenario (digest {theirs.hex()}, here {digest.hex()}): start both with the "
+                    "same scenario file, --protocol and --lag"
+                )
+            if self._syncs and theirs is not None:
+                return
+            taken = self._host.take(received)
+            if not self._syncs and not isinstance(taken, Cause):
+                seen |= sum(1 << status.axis for status in taken)
+                if seen == ALL_AXES:
+                    return
+        raise PeerMissingError(
+            f"no drives on the CAN bus {self._bus.uri.text} answered within {wait_s:g} s, so the run was not armed: start "
+            f"them with `fwav-hil motor SCENARIO --can {self._bus.uri.text} --protocol {self._plan.protocol}`"
+        )
+
+    def drive(self, t_ns: int, tau: FloatArray, acts_ns: int) -> FloatArray:
+        """Command tau (6,) at time t_ns; returns the force behind the gears u (6,), which acts from acts_ns on.
+
+        Raises PeerLostError where the drives are gone for good, CanBusLostError where the bus is, Interrupted.
+        """
+        self._coming.append((acts_ns, tau.copy()))
+        self._now_ns = t_ns
+        frames = self._frames(t_ns, tau)
+        for attempt, wait_s in enumerate(self._waits()):
+            if attempt:
+                self._counters["motor_resent"] += 1
+                self._stop.check()
+            for frame in frames:
+                self._bus.send(frame)
+                if not attempt:
+                    self._note(t_ns, frame)
+            for poll in self.poll:
+                poll()
+            if self._collect(t_ns, wait_s):
+                self._arrived(t_ns)
+                return self._u.copy()
+        self._missed(t_ns)
+        return self._u.copy()
+
+    def tau_at(self, t_ns: int) -> FloatArray:
+        """The torques asked for that are in action at t_ns (6,); times must not decrease."""
+        while self._coming and self._coming[0][0] <= t_ns:
+            self._tau = self._coming.popleft()[1]
+        return self._tau
+
+    def close(self) -> None:
+        """Let the drives go."""
+        try:
+            for frame in self._host.disable():
+                self._bus.send(frame)
+        except FwavHilError:
+            return  # the bus may be what ended the run
+
+    def _frames(self, t_ns: int, tau: FloatArray) -> list[CanFrame]:
+        frames = self._host.cyclic(t_ns)
+        if not self._all_enabled and (self._enable_ns is None or t_ns - self._enable_ns >= ENABLE_AGAIN_NS):
+            self._enable_ns = t_ns
+            self._counters["motor_enables"] += 1
+            frames += self._host.enable([axis for axis in range(DRIVES) if not self._enabled >> axis & 1])
+        frames += self._host.command(tau / self._scale)
+        if self._syncs:
+            frames.append(simulation_sync.encode_sync(t_ns))
+        return frames
+
+    def _waits(self) -> tuple[float, ...]:
+        if not self._lockstep:
+            return (min(SHORT_WAIT_S, 0.25e-9 * self._scenario.period_ns),)
+        return (self._scenario.period_ns * 1e-9,) if self._out_ns is not None else self._waits_s
+
+    def _collect(self, t_ns: int, wait_s: float) -> bool:
+        """Take frames until all six have answered the SYNC of t_ns, or none came any more; whether they have."""
+        answered = 0
+        enabled = 0
+        tick = t_ns // self._scenario.period_ns % TICKS
+        deadline_ns = self._clock.now_ns() + round(wait_s * NANOSECONDS)
+        u = np.zeros(DRIVES)
+        while True:
+            remaining_ns = deadline_ns - self._clock.now_ns()
+            frame = self._bus.recv(max(0.0, remaining_ns * 1e-9) if self._syncs else 0.0)
+            if frame is None:
+                if not self._syncs:
+                    return self._heard_all()
+                return False
+            answer = simulation_sync.decode_answer(frame)
+            if answer is None:
+                if self._begun or not self._syncs:  # what drives said in their own time is not of this run
+                    self._note(t_ns, frame)
+                self._take(frame)
+            elif answer.tick != tick:
+                self._counters["motor_late_answers"] += 1
+            else:
+                if answered >> answer.axis & 1:
+                    self._counters["motor_late_answers"] += 1
+                    continue
+                self._begun = True
+                self._note(t_ns, frame)
+                u[answer.axis] = answer.u
+                answered |= 1 << answer.axis
+                enabled |= answer.enabled << answer.axis
+                if answered == ALL_AXES:
+                    self._u = self._bus_u.copy() if self._from_bus else u
+                    self._enabled = enabled
+                    return True
+            if remaining_ns < -NANOSECONDS:
+                return False
+
+    def _take(self, frame: CanFrame) -> None:
+        """Learn from a frame that is no answer."""
+        if simulation_sync.is_simulation_only(frame):
+            return
+        taken = self._host.take(frame)
+        if isinstance(taken, Cause):
+            self._counters[taken.value] += 1
+            return
+        for status in taken:
+            self._learn(status)
+
+    def _learn(self, status: Status) -> None:
+        bit = 1 << status.axis
+        self._heard |= bit
+        self._counters["motor_faults"] += bool(status.faulty)
+        if not self._syncs:
+            if status.enabled is not None:
+                self._enabled = self._enabled | bit if status.enabled else self._enabled & ~bit
+            elif status.faulty is not None:
+                self._enabled = self._enabled & ~bit if status.faulty else self._enabled | bit
+        if status.velocity is not None:
+            self.velocities[status.axis] = status.velocity
+        if status.position is not None:
+            travel = self._scenario.motor.travel_rad
+            self._bus_u[status.axis] = status.position / travel * self._scale[status.axis]
+
+    def _heard_all(self) -> bool:
+        """Without SYNC: whether each drive has said something since this was last so."""
+        self._u = self._bus_u.copy()
+        if self._heard != ALL_AXES:
+            return False
+        self._heard = 0
+        return True
+
+    def _arrived(self, t_ns: int) -> None:
+        """All six have answered."""
+        self._answered_ns = t_ns
+        self._all_enabled = self._enabled == ALL_AXES
+        if self._out_ns is not None:
+            self._out_ns = None
+            self._recovering = True
+            self._enable_ns = None
+            self._report({"event": "motors_back", "t_ns": t_ns})
+        if not self._all_enabled:
+            self._counters["motor_safe_ticks"] += 1
+        elif self._recovering:
+            self._recovering = False
+            self._counters["motor_recoveries"] += 1
+
+    def _missed(self, t_ns: int) -> None:
+        """The drives have not answered in time."""
+        now_ns = self._clock.now_ns()
+        if self._out_ns is None:
+            limit_ns = round(self._scenario.actuators.staleness_s * NANOSECONDS)
+            if not self._lockstep and t_ns - self._answered_ns <= (2 * NANOSECONDS if not self._syncs else limit_ns):
+                return  # the last u is held
+            self._out_ns = now_ns
+            self._all_enabled = False
+            self._enabled = 0
+            self._counters["motor_outages"] += 1
+            self._report({"event": "motors_lost", "t_ns": t_ns})
+        self._counters["motor_outage_ticks"] += 1
+        self._u = self._safe_u.copy()
+        if now_ns - self._out_ns > GIVE_UP_NS:
+            raise PeerLostError(
+                f"the drives on {self._bus.uri.text} fell silent and did not come back within "
+                f"{GIVE_UP_NS // NANOSECONDS} s (t = {t_ns * 1e-9:.3f} s): the run is disarmed; see whether they still run"
+            )
+
+    def _note(self, t_ns: int, frame: CanFrame) -> None:
+        if not simulation_sync.is_simulation_only(frame):
+            self._counters["bus_bits"] += exact_bits(frame)
+        for watch in self.watches:
+            watch(t_ns, frame)

@@ -1,0 +1,267 @@
+"""The drives as a bus sees them: frames in, frames out, limits and watchdog kept, six nodes in one object. No I/O here.
+
+Time. From the first SYNC on (`motor_lockstep`) a node lives by the bridge's simulation time: it moves when a SYNC comes,
+answers it, and its watchdog counts SYNC time. Without SYNC, as with any other controller, it lives by its own clock. A host
+whose SYNC stays away for 2 s of wall time is taken for gone: time is the node's own again, and the watchdog acts.
+
+A drive gives its safe value (`actuators.safe`) until it is enabled, and again once a fault is latched: no command for
+`watchdog_s`, too hot, or stopped by an Estop. Torque jumps there and every filter is reset.
+
+The first SYNC of a run (t = 0) begins the flight where the direct path would: `initial.command` in action. A node that is
+started in the middle of one begins at its safe value: where the gears stood is lost with the process.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from plant_emulator.drives.motor import DriveBank
+from protocol.can_frame import CanFrame
+from protocol.motors import simulation_sync
+from protocol.motors.motor_protocol import CAUSES, DRIVES, Action, Cause, Drive, Fault, Order, Reading, make_drive
+from protocol.scenario import NANOSECONDS, Scenario
+from protocol.wire.streams import Due
+
+HOST_GONE_NS = 2 * NANOSECONDS
+OWN_STEP_NS = NANOSECONDS // 1000
+"""In its own time a node moves on at least this often, if it is given the chance."""
+LONGEST_STEP_NS = NANOSECONDS // 10
+"""A process that was held up makes up for this much at most."""
+
+
+class MotorNode:
+    """Six drives of one protocol.
+
+    counters   taken              frames with an order for one of the drives
+               syncs, repeated_syncs, backward_syncs, waiting_syncs
+                                  SYNC frames answered; that came again (answered alike, nothing moves); from the past; that
+                                  came before all the commands they name (not answered)
+               watchdog_trips, over_temperatures, estops
+                                  faults latched, drive by drive
+               lost_hosts         times the SYNC stayed away for 2 s
+               and one for each cause of `motor_protocol.Cause`
+    """
+
+    def __init__(self, scenario: Scenario, protocol: str) -> None:
+        motor = scenario.motor
+        self.scenario = scenario
+        self._drive: Drive = make_drive(protocol, motor)
+        self._digest = scenario.drive_digest()
+        self._safe = np.array(scenario.actuators.safe)
+        self._scale = np.array(scenario.actuators.scale)
+        self._initial = np.array(scenario.initial.command)
+        self._watchdog_ns = round(motor.watchdog_s * NANOSECONDS)
+        self.bank = DriveBank(scenario, self._safe)
+        self._encoders = Due(motor.encoder_rate_hz)
+        self._target = self._safe.copy()
+        self._enabled = [False] * DRIVES
+        self._faults = [Fault(0)] * DRIVES
+        self._commanded_ns = [0] * DRIVES
+        self._commanded = 0
+        self._positions = self._angles(self.bank.state.u)
+        self._velocities = np.zeros(DRIVES)
+        self._readings: list[Reading] | None = None
+        self._t_ns = 0
+        self._sync_ns: int | None = None
+        self._answers: list[CanFrame] = []
+        self._heard_ns = 0
+        self._fresh = True
+        names = ("taken", "syncs", "repeated_syncs", "backward_syncs", "waiting_syncs")
+        faults = ("watchdog_trips", "over_temperatures", "estops", "lost_hosts")
+        self.counters = dict.fromkeys((*names, *faults, *CAUSES), 0)
+
+    @property
+    def in_lockstep(self) -> bool:
+        """Whether time is the SYNC's."""
+        return self._sync_ns is not None
+
+    def elapse(self, now_ns: int) -> list[CanFrame]:
+        """Let wall time pass: now_ns from any start. Returns the cyclic messages due, where time is the node's own."""
+        if self.in_lockstep:
+            if now_ns - self._heard_ns < HOST_GONE_NS:
+                return []
+            self.counters["lost_hosts"] += 1
+            self._use_own_time(now_ns)
+        passed_ns = now_ns - self._heard_ns
+        if passed_ns < OWN_STEP_NS:
+            return []
+        self._heard_ns = now_ns
+        self._move(self._t_ns + passed_ns, min(passed_ns, LONGEST_STEP_NS))
+        return self._cyclic()
+
+    def receive(self, frame: CanFrame, now_ns: int) -> list[CanFrame]:
+        """What the drives say to a frame that came at wall time now_ns."""
+        if simulation_sync.is_simulation_only(frame):
+            return self._simulation_frame(frame, now_ns)
+        taken = self._drive.take(frame)
+        if isinstance(taken, Cause):
+            self.counters[taken.value] += 1
+            return []
+        frames: list[CanFrame] = []
+        for order in taken:
+            self.counters["taken"] += 1
+            self._obey(order)
+            frames += self._drive.reply(order, self.readings()[order.axis])
+        return frames
+
+    def readings(self) -> list[Reading]:
+        """The six drives as they show themselves now."""
+        if self._readings is None:
+            state = self.bank.state
+            motor_side = self._angles(state.tau).tolist()
+            self._readings = [
+                Reading(position, velocity, before, target, torque, temperature, enabled, faults)
+                for position, velocity, before, target, torque, temperature, enabled, faults in zip(
+                    self._positions.tolist(),
+                    self._velocities.tolist(),
+                    motor_side,
+                    (self._target / self._scale).tolist(),
+                    (state.tau / self._scale).tolist(),
+                    state.temperature.tolist(),
+                    self._enabled,
+                    self._faults,
+                    strict=True,
+                )
+            ]
+        return self._readings
+
+    def _simulation_frame(self, frame: CanFrame, now_ns: int) -> list[CanFrame]:
+        if simulation_sync.decode_hello(frame, drives=False) is not None:
+            self._fresh = True
+            return [simulation_sync.encode_hello(self._digest, drives=True)]
+        sync = simulation_sync.decode_sync(frame)
+        if sync is None:
+            self.counters[Cause.FOREIGN.value] += 1
+            return []
+        self._heard_ns = now_ns
+        begins = sync.t_ns == 0 and self._fresh
+        if not begins and sync.t_ns == self._sync_ns:
+            self.counters["repeated_syncs"] += 1
+            self._commanded = 0
+            return self._answers
+        if not begins and self._sync_ns is not None and sync.t_ns < self._sync_ns:
+            self.counters["backward_syncs"] += 1
+            return []
+        if sync.commanded & ~self._commanded:
+            self.counters["waiting_syncs"] += 1
+            return []
+        self.counters["syncs"] += 1
+        return self._sync(sync.t_ns, begins=begins)
+
+    def _sync(self, t_ns: int, *, begins: bool) -> list[CanFrame]:
+        """Move to the time of a new SYNC and on over the period it begins; answer it."""
+        period_ns = self.scenario.period_ns
+        if begins:
+            self.bank.begin(self._initial)
+            self._positions = self._angles(self.bank.state.u)
+        if begins or self._sync_ns is None:
+            self._restart_schedule()
+        elif t_ns - self._sync_ns <= LONGEST_STEP_NS:
+            period_ns = t_ns - self._sync_ns
+        for axis in range(DRIVES):
+            if self._commanded >> axis & 1 or self._sync_ns is None:
+                self._commanded_ns[axis] = t_ns
+        self._commanded = 0
+        self._fresh = False
+        self._sync_ns = t_ns
+        self._move(t_ns, period_ns)
+        tick = t_ns // self.scenario.period_ns
+        self._answers = [
+            simulation_sync.encode_answer(axis, tick, u, enabled=self._enabled[axis])
+            for axis, u in enumerate(self.bank.state.mean_u.tolist())
+        ]
+        return self._answers + self._cyclic()
+
+    def _use_own_time(self, now_ns: int) -> None:
+        self._sync_ns = None
+        self._heard_ns = now_ns - OWN_STEP_NS
+        # The host fell silent, so the last commands are as old as that.
+        self._commanded_ns = [self._t_ns - self._watchdog_ns] * DRIVES
+        self._restart_schedule()
+
+    def _restart_schedule(self) -> None:
+        self._drive.restart()
+        self._encoders = Due(self.scenario.motor.encoder_rate_hz)
+
+    def _obey(self, order: Order) -> None:
+        axis = order.axis
+        if order.action is Action.TORQUE:
+            self._commanded |= 1 << axis
+            self._commanded_ns[axis] = self._t_ns
+            if self._enabled[axis]:
+                self._target[axis] = order.torque * self._scale[axis]
+            return  # a reading shows it from the next step on
+        if order.action is Action.ENABLE and not self._faults[axis]:
+            if not self._enabled[axis]:
+                self._enabled[axis] = True
+                self._commanded_ns[axis] = self._t_ns
+        elif order.action is Action.DISABLE:
+            self._let_go(axis)
+        elif order.action is Action.CLEAR:
+            self._faults[axis] = Fault(0)
+        elif order.action is Action.ESTOP and Fault.ESTOP not in self._faults[axis]:
+            self._latch(axis, Fault.ESTOP, "estops")
+        self._readings = None
+
+    def _move(self, t_ns: int, duration_ns: int) -> None:
+        """Let the drives run for duration_ns; t_ns is the time that the watchdog counts."""
+        self._t_ns = t_ns
+        for axis in range(DRIVES):
+            if self._enabled[axis] and t_ns - self._commanded_ns[axis] > self._watchdog_ns:
+                self._latch(axis, Fault.WATCHDOG, "watchdog_trips")
+        self.bank.step(self._target, duration_ns)
+        hot = self.scenario.motor.over_temperature_celsius
+        for axis, temperature in enumerate(self.bank.state.temperature.tolist()):
+            if temperature > hot and self._enabled[axis]:
+                self._latch(axis, Fault.OVER_TEMPERATURE, "over_temperatures")
+        positions = self._angles(self.bank.state.u)
+        resolution = self.scenario.motor.velocity_resolution
+        velocities = (positions - self._positions) / (duration_ns / NANOSECONDS)
+        self._velocities = np.round(velocities / resolution) * resolution if resolution else velocities
+        self._positions = positions
+        self._readings = None
+
+    def _latch(self, axis: int, fault: Fault, counter: str) -> None:
+        self.counters[counter] += 1
+        self._faults[axis] |= fault
+        self._let_go(axis)
+
+    def _let_go(self, axis: int) -> None:
+        self._enabled[axis] = False
+        self._target[axis] = self._safe[axis]
+        self.bank.jump(axis, float(self._safe[axis]))
+
+    def _cyclic(self) -> list[CanFrame]:
+        readings = self.readings()
+        frames = self._drive.cyclic(self._t_ns, readings)
+        if self._encoders.at(self._t_ns):
+            frames += [
+                simulation_sync.encode_encoders(axis, reading.motor_position, reading.position)
+                for axis, reading in enumerate(readings)
+            ]
+        return frames
+
+    def _angles(self, force: np.typing.NDArray[np.float64]) -> np.typing.NDArray[np.float64]:
+        """Shaft angles (6,), in whole counts of the encoder, that stand for a torque or force (6,)."""
+        motor = self.scenario.motor
+        count = 2.0 * math.pi / motor.encoder_counts
+        return np.asarray(np.round(force / self._scale * motor.travel_rad / count) * count)
+
+
+def is_of_drives(frame: CanFrame) -> bool:
+    """Whether only drives of another node process say this on a bus: their answers, their hello, their encoders."""
+    return (
+        simulation_sync.decode_answer(frame) is not None
+        or simulation_sync.decode_hello(frame, drives=True) is not None
+        or simulation_sync.decode_encoders(frame) is not None
+    )
+
+
+def warm_up(scenario: Scenario, protocol: str) -> Sequence[CanFrame]:
+    """Have every kernel of a node compiled (or loaded)."""
+    node = MotorNode(scenario, protocol)
+    node.bank.jump(0, 0.0)
+    return node.receive(simulation_sync.encode_sync(0, 0), 0)

@@ -1,0 +1,115 @@
+"""The drives as a process, or as a thread beside an emulator where the bus cannot leave the process."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import msgspec
+
+from bridge.motor_bus.can_bus import CanBus
+from bridge.process import StopFlag, take_folder
+from bridge.reporting import Report
+from bridge.summary import write_json
+from bridge.timing.clock import Clock, MonotonicClock
+from plant_emulator.drives.motor_node import MotorNode, is_of_drives, warm_up
+from protocol.errors import FwavHilError, LinkInUseError
+from protocol.scenario import NANOSECONDS, Scenario
+
+RESULT = "motor.json"
+LISTEN_S = 0.25
+"""Time in which drives that are on the bus already are noticed: they show their encoders far more often."""
+LOCKSTEP_WAIT_S = 0.1
+OWN_WAIT_S = 0.001
+
+
+class MotorOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """How the process runs. can: URI of the bus."""
+
+    can: str
+    protocol: str
+    out: Path | None = None
+    listen_s: float = LISTEN_S
+
+
+def run_motor(scenario: Scenario, options: MotorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
+    """Be the six drives on a bus until asked to stop; returns what was counted. Raises the errors of `protocol.errors`."""
+    if options.out:
+        take_folder(options.out, RESULT)
+    warm_up(scenario, options.protocol)
+    with CanBus(options.can, scenario.motor.bitrate) as bus:
+        clock = MonotonicClock()
+        _refuse_other_drives(bus, clock, options.listen_s)
+        node = MotorNode(scenario, options.protocol)
+        report({"event": "waiting", "link": options.can})
+        error: FwavHilError | None = None
+        try:
+            while not stop.requested:
+                serve_once(node, bus, clock)
+        except FwavHilError as stopped:
+            error = stopped
+        summary = {
+            "protocol": options.protocol,
+            "can": options.can,
+            "counters": {**bus.counters, **node.counters},
+            "error": str(error) if error else None,
+        }
+    if options.out:
+        write_json(options.out / RESULT, summary)
+    report({"event": "ended", **summary})
+    if error:
+        raise error
+    return summary
+
+
+def serve_once(node: MotorNode, bus: CanBus, clock: Clock) -> None:
+    """Take the next frame, if one comes soon, and let time pass."""
+    frame = bus.recv(LOCKSTEP_WAIT_S if node.in_lockstep else OWN_WAIT_S)
+    now_ns = clock.now_ns()
+    if frame is not None:
+        for answer in node.receive(frame, now_ns):
+            bus.send(answer)
+    for cyclic in node.elapse(now_ns):
+        bus.send(cyclic)
+
+
+def _refuse_other_drives(bus: CanBus, clock: Clock, listen_s: float) -> None:
+    """Raise LinkInUseError where other drives speak on the bus already."""
+    until_ns = clock.now_ns() + round(listen_s * NANOSECONDS)
+    while (remaining_ns := until_ns - clock.now_ns()) > 0:
+        frame = bus.recv(remaining_ns * 1e-9)
+        if frame is not None and is_of_drives(frame):
+            raise LinkInUseError(
+                f"there are drives on the CAN bus {bus.uri.text} already ({frame}): end those, or choose another bus with --can"
+            )
+
+
+class MotorThread:
+    """The drives in a thread of this process, for `virtual:` buses and tests; `with` starts and ends it."""
+
+    def __init__(self, scenario: Scenario, protocol: str, uri: str) -> None:
+        self.node = MotorNode(scenario, protocol)
+        self._bus = CanBus(uri, scenario.motor.bitrate)
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="motors", daemon=True)
+
+    def _serve(self) -> None:
+        clock = MonotonicClock()
+        while not self._ending.is_set():
+            try:
+                serve_once(self.node, self._bus, clock)
+            except FwavHilError:
+                return  # the emulator notices that nobody answers
+
+    def __enter__(self) -> MotorThread:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ending.set()
+        self._thread.join(10.0)
+        self._bus.close()

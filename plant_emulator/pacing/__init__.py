@@ -1,0 +1,1 @@
+"""How time is kept between the emulator and its peer."""

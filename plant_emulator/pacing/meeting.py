@@ -1,0 +1,89 @@
+"""Before the first tick: the plant is held where it starts until a controller, or an autopilot, is there."""
+
+from __future__ import annotations
+
+from bridge.endpoint import Endpoint, refuse_other_scenario
+from bridge.process import StopFlag
+from bridge.timing.clock import MonotonicClock
+from plant_emulator.on_request import OnRequest
+from protocol.errors import PeerMissingError
+from protocol.messages import VEHICLE
+from protocol.scenario import NANOSECONDS, Scenario
+from protocol.wire import mapping
+from protocol.wire.streams import Due
+
+HELLO_PERIOD_S = 0.1
+
+
+def meet_controller(
+    scenario: Scenario, wait_s: float, endpoint: Endpoint, stop: StopFlag, on_request: OnRequest | None = None
+) -> None:
+    """Hold the plant at t = 0 until a controller with the same scenario says it is armed. Raises PeerError, Interrupted."""
+    digest = scenario.digest()
+    agreed = heard = False
+    clock = MonotonicClock()
+    give_up_ns = clock.now_ns() + round(wait_s * NANOSECONDS)
+    due = Due(1.0 / HELLO_PERIOD_S)
+    while (now_ns := clock.now_ns()) < give_up_ns:
+        stop.check()
+        hello = [
+            endpoint.seal(mapping.HEARTBEAT, mapping.encode_emulator_heartbeat()),
+            endpoint.seal(mapping.VERSION, mapping.encode_version(digest)),
+        ]
+        if heard and due.at(now_ns):
+            endpoint.send(hello)
+        received = endpoint.receive(HELLO_PERIOD_S)
+        if on_request:
+            for frame in received:
+                on_request.take(frame)
+            if replies := on_request.replies():
+                endpoint.send(endpoint.seal(*reply) for reply in replies)
+        for frame in received:
+            if (frame.system, frame.component) != VEHICLE:
+                continue
+            if not heard:
+                endpoint.send(hello)
+            heard = True
+            if frame.message_id == mapping.VERSION.message_id:
+                refuse_other_scenario("controller", mapping.decode_version(frame.payload), digest)
+                agreed = True
+            elif (
+                frame.message_id == mapping.HEARTBEAT.message_id
+                and agreed
+                and mapping.heartbeat_is_armed(frame.payload)
+            ):
+                endpoint.writer.sequence = 0  # the numbers of the run, and so its log, begin with the first tick
+                return
+    uri = endpoint.link.uri
+    if heard:
+        raise PeerMissingError(
+            f"the controller at {endpoint.link.peer} did not arm within {wait_s:g} s: start it with --arm"
+        )
+    raise PeerMissingError(
+        f"no controller came to {uri} within {wait_s:g} s: start one with `fwav-hil controller "
+        f"SCENARIO --link {uri.replace('in://', 'out://', 1)}`, or wait longer with --wait"
+    )
+
+
+def meet_autopilot(wait_s: float, endpoint: Endpoint, stop: StopFlag, on_request: OnRequest) -> None:
+    """Say hello until an autopilot (1/1) says anything. Raises PeerMissingError, Interrupted.
+
+    PX4 over TCP speaks when it is accepted; over UDP it waits to be spoken to.
+    """
+    clock = MonotonicClock()
+    give_up_ns = clock.now_ns() + round(wait_s * NANOSECONDS)
+    due = Due(1.0 / HELLO_PERIOD_S)
+    while (now_ns := clock.now_ns()) < give_up_ns:
+        stop.check()
+        if due.at(now_ns):
+            endpoint.send([endpoint.seal(mapping.HEARTBEAT, mapping.encode_emulator_heartbeat())])
+        received = endpoint.receive(HELLO_PERIOD_S)
+        for frame in received:
+            on_request.take(frame)  # answered with the first tick
+        if any((frame.system, frame.component) == VEHICLE for frame in received):
+            endpoint.writer.sequence = 0
+            return
+    raise PeerMissingError(
+        f"no autopilot came to {endpoint.link.uri} within {wait_s:g} s: start one that looks for its simulator there (PX4: "
+        "a TCP client of port 4560, so --link tcpin://127.0.0.1:4560), or wait longer with --wait"
+    )

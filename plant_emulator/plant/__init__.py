@@ -1,0 +1,1 @@
+"""The plant: rigid body, gears, sensors, safety envelope, ground truth."""

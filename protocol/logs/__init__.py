@@ -1,0 +1,1 @@
+"""Telemetry logs: writing, reading, changing."""

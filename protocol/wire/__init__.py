@@ -1,0 +1,1 @@
+"""MAVLink on the wire: framing, mapping, streams, signatures."""

@@ -1,0 +1,371 @@
+"""Our messages as MAVLink messages and back: scale, range, resolution and the meaning of NaN, one function each way.
+
+Positions and quaternions travel as float32, commands as float32 fractions of the scenario's scale. The compiled functions
+at the top are that mapping; the in-process simulation applies the very same ones, so that it equals the wire to the bit.
+A payload that holds bad data (NaN where a number must be, a quaternion that is not unit) decodes to None.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from pymavlink.dialects.v20 import common
+
+from protocol.can_frame import EXTENDED_IDS, LONGEST_DATA, STANDARD_IDS, CanFrame
+from protocol.compiled import Packed, compiled
+from protocol.messages import ActuatorCommand, FloatArray, PositionSample
+from protocol.rotations import euler_from_quaternion, quaternion_from_euler
+from protocol.wire.codec import layout
+
+POSE = layout("ATT_POS_MOCAP")
+TICK = layout("HIL_SENSOR")
+GPS = layout("HIL_GPS")
+COMMAND = layout("HIL_ACTUATOR_CONTROLS")
+HEARTBEAT = layout("HEARTBEAT")
+VERSION = layout("AUTOPILOT_VERSION")
+POSITION_TARGET = layout("POSITION_TARGET_LOCAL_NED")
+ATTITUDE_TARGET = layout("ATTITUDE_TARGET")
+COMMAND_LONG = layout("COMMAND_LONG")
+COMMAND_ACK = layout("COMMAND_ACK")
+TIMESYNC = layout("TIMESYNC")
+CAN_FRAME = layout("CAN_FRAME")
+
+UNIT_TOLERANCE = 1e-3
+"""How far the length of a quaternion may be from one."""
+ALL_SENSORS = 0x1FFF
+"""HIL_SENSOR.fields_updated with the bits of every group: accelerometer, gyroscope, magnetometer, pressures, temperature."""
+LOCKSTEP_FLAG = 1
+ARMED = common.MAV_MODE_FLAG_SAFETY_ARMED
+HIL = common.MAV_MODE_FLAG_HIL_ENABLED
+_CUSTOM = common.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+POSE_READ = 8 + 7 * 4
+"""Bytes of ATT_POS_MOCAP that are read: time, quaternion and position come first on the wire, in this order."""
+TICK_BASE = 64
+"""Size of HIL_SENSOR without its extension, the instance id."""
+COMMAND_MODE = 80
+"""Where HIL_ACTUATOR_CONTROLS has its mode: after time, flags and controls."""
+
+
+@compiled
+def _float32(value: float) -> float:
+    """The nearest float32, as a float64."""
+    return float(np.float32(value))
+
+
+@compiled
+def pose_to_wire(q: FloatArray, wire: FloatArray) -> None:
+    """Fill `wire` (7,) with what ATT_POS_MOCAP carries of q (6,): quaternion w x y z, then x y z, float32 values."""
+    w, x, y, z = quaternion_from_euler(q[3], q[4], q[5])
+    wire[0] = _float32(w)
+    wire[1] = _float32(x)
+    wire[2] = _float32(y)
+    wire[3] = _float32(z)
+    for i in range(3):
+        wire[4 + i] = _float32(q[i])
+
+
+@compiled
+def pose_from_wire(wire: FloatArray, q: FloatArray) -> None:
+    """Fill q (6,) from `wire` (7,): position, then roll, pitch, yaw in [-pi, pi]."""
+    q[0] = wire[4]
+    q[1] = wire[5]
+    q[2] = wire[6]
+    q[3], q[4], q[5] = euler_from_quaternion(wire[0], wire[1], wire[2], wire[3])
+
+
+@compiled
+def fill_pose(message: Any, t_us: int, q: FloatArray) -> None:
+    """Fill an ATT_POS_MOCAP structure: covariance unknown (its first value NaN), and no velocity, which it does not have."""
+    w, x, y, z = quaternion_from_euler(q[3], q[4], q[5])
+    message.time_usec = t_us
+    message.q[0] = w
+    message.q[1] = x
+    message.q[2] = y
+    message.q[3] = z
+    message.x = q[0]
+    message.y = q[1]
+    message.z = q[2]
+    message.covariance[0] = math.nan
+
+
+@compiled
+def pose_of_values(values: npt.NDArray[np.float32], q: FloatArray) -> bool:
+    """Fill q (6,) from the seven float32 of ATT_POS_MOCAP in wire order; False where they are no pose."""
+    wire = np.empty(7)
+    for i in range(7):
+        wire[i] = values[i]
+    length_squared = wire[0] * wire[0] + wire[1] * wire[1] + wire[2] * wire[2] + wire[3] * wire[3]
+    if not abs(length_squared - 1.0) < 2.0 * UNIT_TOLERANCE:  # written so that NaN fails it
+        return False
+    if not math.isfinite(wire[4] + wire[5] + wire[6]):
+        return False
+    pose_from_wire(wire, q)
+    return True
+
+
+@compiled
+def fill_tick(message: Any, t_us: int, readings: FloatArray) -> None:
+    """Fill a HIL_SENSOR structure, id 0; readings (13,) as in `encode_tick`."""
+    message.time_usec = t_us
+    message.xacc = readings[0]
+    message.yacc = readings[1]
+    message.zacc = readings[2]
+    message.xgyro = readings[3]
+    message.ygyro = readings[4]
+    message.zgyro = readings[5]
+    message.xmag = readings[6]
+    message.ymag = readings[7]
+    message.zmag = readings[8]
+    message.abs_pressure = readings[9]
+    message.diff_pressure = readings[10]
+    message.pressure_alt = readings[11]
+    message.temperature = readings[12]
+    message.fields_updated = ALL_SENSORS
+
+
+@compiled
+def fill_command(message: Any, t_us: int, tau: FloatArray, scale: FloatArray, armed: bool, lockstep: bool) -> None:
+    """Fill a HIL_ACTUATOR_CONTROLS structure: fractions of the scale; zeros when disarmed."""
+    message.time_usec = t_us
+    message.flags = LOCKSTEP_FLAG if lockstep else 0
+    for i in range(6):
+        message.controls[i] = command_to_wire(tau[i], scale[i]) if armed else 0.0
+    message.mode = _CUSTOM | HIL | ARMED if armed else _CUSTOM | HIL
+
+
+@compiled
+def tau_of_controls(controls: npt.NDArray[np.float32], scale: FloatArray, tau: FloatArray) -> bool:
+    """Fill tau (6,) from the first six controls; False where one is not finite."""
+    total = 0.0
+    for i in range(6):
+        tau[i] = command_from_wire(float(controls[i]), scale[i])
+        total += tau[i]
+    return math.isfinite(total)
+
+
+@compiled
+def command_to_wire(tau: float, scale: float) -> float:
+    """What HIL_ACTUATOR_CONTROLS carries of one channel: the float32 fraction of its scale."""
+    return _float32(tau / scale)
+
+
+@compiled
+def command_from_wire(control: float, scale: float) -> float:
+    """The command of one channel from its fraction."""
+    return control * scale
+
+
+@compiled
+def _fill_pose_packed(message: Packed, t_us: int, q: FloatArray) -> None:
+    fill_pose(message[0], t_us, q)
+
+
+@compiled
+def _fill_tick_packed(message: Packed, t_us: int, readings: FloatArray) -> None:
+    fill_tick(message[0], t_us, readings)
+
+
+@compiled
+def _fill_command_packed(
+    message: Packed, t_us: int, tau: FloatArray, scale: FloatArray, armed: bool, lockstep: bool
+) -> None:
+    fill_command(message[0], t_us, tau, scale, armed, lockstep)
+
+
+def encode_pose(t_ns: int, q: FloatArray) -> bytes:
+    """ATT_POS_MOCAP payload of the position and attitude q (6,)."""
+    message = np.zeros(1, POSE.dtype)
+    _fill_pose_packed(message, t_ns // 1000, q)
+    return message.tobytes()
+
+
+def decode_pose(payload: bytes) -> PositionSample | None:
+    """The sample, or None where a position is not finite or the quaternion not of unit length."""
+    if len(payload) < POSE_READ:
+        payload = payload.ljust(POSE_READ, b"\0")
+    q = np.empty(6)
+    if not pose_of_values(np.frombuffer(payload, "<f4", 7, 8), q):
+        return None
+    return PositionSample(int.from_bytes(payload[:8], "little") * 1000, q)
+
+
+def encode_tick(t_ns: int, readings: FloatArray) -> bytes:
+    """HIL_SENSOR payload, id 0.
+
+    readings (13,): specific force (m/s^2) and body rates (rad/s) in the body frame, field (gauss) in the body frame,
+    absolute and differential pressure (hPa), pressure altitude (m), temperature (Celsius).
+    """
+    message = np.zeros(1, TICK.dtype)
+    _fill_tick_packed(message, t_ns // 1000, np.asarray(readings, dtype=float))
+    return message.tobytes()
+
+
+def decode_tick_time_ns(payload: bytes) -> int:
+    """Simulation time of a HIL_SENSOR: all that the controller reads of it."""
+    return int.from_bytes(payload[:8].ljust(8, b"\0"), "little") * 1000
+
+
+def tick_sensor_id(payload: bytes) -> int:
+    """Which instance a HIL_SENSOR speaks for; the tick is instance 0."""
+    return payload[TICK_BASE] if len(payload) > TICK_BASE else 0
+
+
+def encode_gps(t_ns: int, latitude_deg: float, longitude_deg: float, altitude: float, velocity: FloatArray) -> bytes:
+    """HIL_GPS payload, 3D fix. Velocity north, east, down in m/s; eph and epv in cm (as PX4 reads them).
+
+    What a field cannot hold is held at its end: a plant far away is no reason to stop.
+    """
+    north, east, down = (saturated(100.0 * v, 32767) for v in velocity)
+    speed = saturated(100.0 * math.hypot(velocity[0], velocity[1]), 65534)
+    course = round(math.degrees(math.atan2(velocity[1], velocity[0])) * 100.0) % 36000 if speed else 65535
+    return GPS.pack_fields(
+        time_usec=t_ns // 1000,
+        fix_type=3,
+        lat=saturated(latitude_deg * 1e7, 2**31 - 1),
+        lon=saturated(longitude_deg * 1e7, 2**31 - 1),
+        alt=saturated(altitude * 1000.0, 2**31 - 1),
+        eph=30,
+        epv=40,
+        vel=speed,
+        vn=north,
+        ve=east,
+        vd=down,
+        cog=course,
+        satellites_visible=12,
+    )
+
+
+def saturated(value: float, limit: int) -> int:
+    """The nearest whole number within +-limit."""
+    return round(max(-limit, min(limit, value)))
+
+
+def encode_command(command: ActuatorCommand, scale: FloatArray, *, lockstep: bool) -> bytes:
+    """HIL_ACTUATOR_CONTROLS payload: fractions of the scale (6,); zeros when disarmed."""
+    message = np.zeros(1, COMMAND.dtype)
+    scale = np.asarray(scale, dtype=float)
+    _fill_command_packed(message, command.t_ns // 1000, command.tau, scale, command.armed, lockstep)
+    return message.tobytes()
+
+
+def decode_command(payload: bytes, scale: FloatArray) -> ActuatorCommand | None:
+    """The command, or None where a control of the six is not finite; scale (6,)."""
+    if len(payload) < COMMAND.size:
+        payload = payload.ljust(COMMAND.size, b"\0")
+    tau = np.empty(6)
+    if not tau_of_controls(np.frombuffer(payload, "<f4", 6, 16), np.asarray(scale, dtype=float), tau):
+        return None
+    return ActuatorCommand(int.from_bytes(payload[:8], "little") * 1000, tau, payload[COMMAND_MODE] & ARMED != 0)
+
+
+def encode_controller_heartbeat(*, armed: bool, ending: bool = False) -> bytes:
+    """HEARTBEAT of the vehicle: flapping wing, generic autopilot, HIL on."""
+    return HEARTBEAT.pack_fields(
+        type=common.MAV_TYPE_FLAPPING_WING,
+        autopilot=common.MAV_AUTOPILOT_GENERIC,
+        base_mode=HIL | (ARMED if armed else 0),
+        system_status=_status(armed=armed, ending=ending),
+        mavlink_version=3,
+    )
+
+
+def encode_emulator_heartbeat(*, ending: bool = False) -> bytes:
+    """HEARTBEAT of the simulator: no autopilot. `ending` says that the run is over."""
+    return HEARTBEAT.pack_fields(
+        type=common.MAV_TYPE_GENERIC,
+        autopilot=common.MAV_AUTOPILOT_INVALID,
+        system_status=_status(armed=True, ending=ending),
+        mavlink_version=3,
+    )
+
+
+def _status(*, armed: bool, ending: bool) -> int:
+    if ending:
+        return int(common.MAV_STATE_POWEROFF)
+    return int(common.MAV_STATE_ACTIVE if armed else common.MAV_STATE_STANDBY)
+
+
+def heartbeat_is_armed(payload: bytes) -> bool:
+    """Whether the sender of a HEARTBEAT says it is armed."""
+    return bool(HEARTBEAT.unpack_fields(payload)["base_mode"] & ARMED)
+
+
+def heartbeat_is_ending(payload: bytes) -> bool:
+    """Whether the sender of a HEARTBEAT is shutting down."""
+    return bool(HEARTBEAT.unpack_fields(payload)["system_status"] == common.MAV_STATE_POWEROFF)
+
+
+def encode_version(digest: bytes, *, has_parameters: bool = False) -> bytes:
+    """AUTOPILOT_VERSION payload with the scenario's digest (8 bytes) as flight_custom_version.
+
+    has_parameters: the sender has some, floats as floats and integers bytewise.
+    """
+    capabilities = common.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    if has_parameters:
+        capabilities |= common.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+        capabilities |= common.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    return VERSION.pack_fields(capabilities=capabilities, flight_custom_version=digest, flight_sw_version=1 << 16)
+
+
+def decode_version(payload: bytes) -> bytes:
+    """The 8 bytes of the sender's scenario."""
+    return bytes(VERSION.unpack_fields(payload)["flight_custom_version"])
+
+
+def encode_position_target(t_ns: int, q: FloatArray, q_dot: FloatArray, q_ddot: FloatArray) -> bytes:
+    """POSITION_TARGET_LOCAL_NED payload of a reference: position, velocity, acceleration, yaw."""
+    return POSITION_TARGET.pack_fields(
+        time_boot_ms=t_ns // 1_000_000,
+        coordinate_frame=common.MAV_FRAME_LOCAL_NED,
+        **dict(zip(("x", "y", "z"), q[:3].tolist(), strict=True)),
+        **dict(zip(("vx", "vy", "vz"), q_dot[:3].tolist(), strict=True)),
+        **dict(zip(("afx", "afy", "afz"), q_ddot[:3].tolist(), strict=True)),
+        yaw=float(q[5]),
+        yaw_rate=float(q_dot[5]),
+    )
+
+
+def encode_attitude_target(t_ns: int, q: FloatArray) -> bytes:
+    """ATTITUDE_TARGET payload of a reference; rates and thrust are marked as not given."""
+    ignored = (
+        common.ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE
+        | common.ATTITUDE_TARGET_TYPEMASK_BODY_PITCH_RATE_IGNORE
+        | common.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE
+        | common.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE
+    )
+    attitude = quaternion_from_euler(float(q[3]), float(q[4]), float(q[5]))
+    return ATTITUDE_TARGET.pack_fields(time_boot_ms=t_ns // 1_000_000, q=attitude, type_mask=ignored)
+
+
+def encode_timesync(answer_ns: int, asked_ns: int) -> bytes:
+    """TIMESYNC payload: tc1 (0 in a question) and ts1, both ns of the clock of who fills them in."""
+    return TIMESYNC.pack_fields(tc1=answer_ns, ts1=asked_ns)
+
+
+def decode_timesync(payload: bytes) -> tuple[int, int]:
+    """(tc1, ts1) of a TIMESYNC, ns."""
+    values = TIMESYNC.unpack_fields(payload)
+    return int(values["tc1"]), int(values["ts1"])
+
+
+_CAN_EXTENDED = 1 << 31
+_CAN_REMOTE = 1 << 30
+
+
+def encode_can_frame(frame: CanFrame) -> bytes:
+    """CAN_FRAME payload, bus 0, for whoever listens; bit 31 of the identifier marks 29 bits, bit 30 a remote frame."""
+    flags = (_CAN_EXTENDED if frame.extended else 0) | (_CAN_REMOTE if frame.remote else 0)
+    return CAN_FRAME.pack_fields(id=frame.can_id | flags, len=len(frame.data), data=frame.data)
+
+
+def decode_can_frame(payload: bytes) -> CanFrame | None:
+    """The frame in a CAN_FRAME for us on bus 0; None where it is for somebody else or no classical frame."""
+    values = CAN_FRAME.unpack_fields(payload)
+    extended, remote = bool(values["id"] & _CAN_EXTENDED), bool(values["id"] & _CAN_REMOTE)
+    can_id = values["id"] & (EXTENDED_IDS - 1)
+    if values["bus"] != 0 or values["len"] > LONGEST_DATA or (not extended and can_id >= STANDARD_IDS):
+        return None
+    return CanFrame(can_id, b"" if remote else bytes(values["data"][: values["len"]]), extended, remote)

@@ -1,0 +1,84 @@
+"""The registry of the laws; each of them keeps the contract."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import msgspec
+import pytest
+
+from controller.laws.law import make_law
+from controller.laws.registry import LAWS, refuse_on_a_link
+from protocol.errors import ScenarioError, UsageError
+from protocol.scenario import find_scenario, load_scenario
+from tests.contracts.law_contract import LawContract
+
+
+class TestUde(LawContract):
+    name = "ude"
+
+
+class TestUdeState(LawContract):
+    name = "ude_state"
+
+
+class TestPd(LawContract):
+    name = "pd"
+
+
+class TestDob(LawContract):
+    name = "dob"
+
+
+class TestDobFeedForward(LawContract):
+    name = "dob_ff"
+
+
+class TestUncompensated(LawContract):
+    name = "uncompensated"
+
+
+def test_every_law_has_its_contract_tested() -> None:
+    tested = [
+        test.name
+        for test in globals().values()
+        if isinstance(test, type) and issubclass(test, LawContract) and test is not LawContract
+    ]
+    assert sorted(tested) == sorted(LAWS)
+
+
+def test_a_law_there_is_not_is_named_with_those_there_are() -> None:
+    scenario = load_scenario(find_scenario("flapper"))
+    with pytest.raises(UsageError, match="no law 'pid'") as caught:
+        make_law("pid", scenario)
+    for name in LAWS:
+        assert name in str(caught.value)
+
+
+def test_every_law_says_what_it_is() -> None:
+    summaries = [entry.summary for entry in LAWS.values()]
+    assert all(summaries)
+    assert len(set(summaries)) == len(summaries)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_what_cannot_fly_on_a_link_is_refused_without_making_it(name: str) -> None:
+    scenario = msgspec.structs.replace(load_scenario(find_scenario("flapper")), law=name)
+    if LAWS[name].needs_velocity:
+        with pytest.raises(UsageError, match=f"'{name}' needs velocities, which the link does not carry"):
+            refuse_on_a_link(scenario)
+        return
+    refuse_on_a_link(scenario)
+    first = msgspec.structs.replace(scenario, control=msgspec.structs.replace(scenario.control, order=1))
+    with pytest.raises(ScenarioError) as early:
+        refuse_on_a_link(first)
+    with pytest.raises(ScenarioError) as late:
+        make_law(name, first)
+    assert str(early.value) == str(late.value)
+
+
+def test_the_registry_loads_no_law() -> None:
+    program = "import sys, controller.laws.registry; print('numba' in sys.modules, 'numpy' in sys.modules)"
+    told = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
+    assert told == "False False\n"
