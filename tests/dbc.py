@@ -8,12 +8,12 @@ from typing import Any
 
 import cantools
 
-import protocol
+import protocol.motors
 
 
 def our_dbc(name: str) -> Any:
-    """The database of protocol/motor_NAME.dbc."""
-    return cantools.database.load_file(Path(protocol.__file__).with_name(f"motor_{name}.dbc"))
+    """The database of protocol/motors/NAME.dbc."""
+    return cantools.database.load_file(Path(protocol.motors.__file__).with_name(f"{name}.dbc"))
 
 
 def published_odrive_dbc() -> Any:

@@ -1,7 +1,7 @@
 """MIT mini-cheetah protocol, as T-Motor AK drives speak it ("MIT power mode").
 
 Source: B. Katz, "A low cost modular actuator for dynamic robots" (MIT, 2018) and its firmware's CAN description; CubeMars
-"AK Series Actuator Driver Manual" V1.0.8, section 5.3. Layout in motor_mit.dbc, for drive 1, raw numbers.
+"AK Series Actuator Driver Manual" V1.0.8, section 5.3. Layout in mit.dbc, for drive 1, raw numbers.
 
     command   identifier: drive   8 bytes, big endian: position 16 bits, velocity 12, kp 12, kd 12, torque 12
     enter     FF FF FF FF FF FF FF FC      exit  ... FD      set zero  ... FE

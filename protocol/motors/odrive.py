@@ -1,7 +1,7 @@
 """ODrive CANSimple, firmware 0.6 (ODrive Pro, S1, Micro).
 
 Source: ODrive documentation, "CAN Protocol" (docs.odriverobotics.com/v/latest/manual/can-protocol.html), and the DBC that
-ODrive publishes for 0.6.10; our part of it stands in motor_odrive.dbc, which is written for node 0. Firmware 0.5 differs:
+ODrive publishes for 0.6.10; our part of it stands in odrive.dbc, which is written for node 0. Firmware 0.5 differs:
 Get_Error (0x03) and Get_Temperature (0x15) have other contents there.
 
     identifier (11 bits)   node << 5 | message           all numbers little endian, float32, uint32, uint8

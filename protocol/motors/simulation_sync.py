@@ -1,6 +1,6 @@
 """Frames that exist in simulation only: they give a bus that carries no time the lockstep it needs.
 
-Layout in motor_lockstep.dbc, whose node SIMULATION_ONLY says so. All are classical frames with identifiers of 11 bits, so
+Layout in simulation_sync.dbc, whose node SIMULATION_ONLY says so. All are classical frames with identifiers of 11 bits, so
 that any interface carries them, and DroneCAN, which speaks 29 bits only, never sees one. ODrive nodes from 44 on and MIT
 drives from 0x580 on would share them, and are refused by the scenario (`motor.first_node_id`).
 

@@ -22,7 +22,7 @@ from protocol.motors.simulation_sync import (
 )
 from tests.dbc import our_dbc
 
-DATABASE = our_dbc("lockstep")
+DATABASE = our_dbc("simulation_sync")
 
 
 @given(st.integers(0, 5), st.integers(0, 10**9), st.floats(allow_nan=False, allow_infinity=False), st.booleans())
