@@ -130,7 +130,7 @@ def signing_key_of(path: Path | None) -> bytes | None:
     """The key in a file, or None where none is named. Raises UsageError."""
     if path is None:
         return None
-    from protocol.logs.retime import read_key
+    from protocol.wire.signing import read_key
 
     return read_key(path)
 

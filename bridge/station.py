@@ -13,11 +13,12 @@ from bridge.links.link import Link
 from bridge.process import StopFlag, open_patiently
 from bridge.summary import make_folder
 from bridge.timing.clock import Clock, MonotonicClock
+from protocol.due import Due
 from protocol.errors import LinkError
 from protocol.logs.tlog import TlogWriter
 from protocol.wire import mapping
 from protocol.wire.codec import Frame, FrameReader, FrameWriter, Layout
-from protocol.wire.streams import Due, stream
+from protocol.wire.streams import stream
 
 POLL_HZ = 50.0
 """How often an end of the loop looks at its station's link, in simulation time."""

@@ -1,11 +1,8 @@
-"""The controller as a process: read, step, publish, keep time."""
+"""The controller as a process: wait for samples, have the tick answer them, and keep time."""
 
 from __future__ import annotations
 
-import functools
 import sys
-from collections import deque
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,7 +14,6 @@ from bridge.links.memory import memory_pair
 from bridge.links.signed_link import signed
 from bridge.process import StopFlag, open_patiently, take_folder
 from bridge.reporting import Report
-from bridge.requests import NEVER
 from bridge.station import Station, open_station
 from bridge.summary import write_json
 from bridge.timing.clock import Clock, MonotonicClock, processor_time_ns
@@ -28,21 +24,19 @@ from controller.laws.law import Law, make_law
 from controller.laws.registry import refuse_on_a_link
 from controller.options import ControllerOptions
 from controller.parameters import Parameters
-from controller.quick import QuickAnswers
-from controller.sinks.hil import HilActuation
-from controller.sources.hil import HilTelemetry
+from controller.session import HilSession
+from controller.sinks.hil import HilSink
+from controller.sources.hil import HilSource
 from controller.station.ground_station import GroundStation
-from controller.vehicle import Vehicle
-from protocol.errors import FwavHilError, Interrupted, LinkClosedError, PeerLostError, PeerMissingError, UsageError
-from protocol.messages import VEHICLE, ActuatorCommand, PositionSample
+from controller.tick import Tick, reference_encoders
+from protocol.due import NEVER
+from protocol.errors import FwavHilError, Interrupted, LinkClosedError, PeerLostError, UsageError
+from protocol.messages import VEHICLE
 from protocol.scenario import Scenario
 from protocol.wire import mapping
-from protocol.wire.streams import HEARTBEAT_TIMEOUT_NS, Due
-from protocol.wire.tick_frames import CommandWriter
 
 RESULT = "controller.json"
 STATION_FILE = "station_controller.tlog"
-HELLO_PERIOD_S = 0.1
 LOOK_PERIOD_S = 0.1
 PATIENCE_PERIODS = 1.5
 """In real time a sample that is this late counts as missing: the last command is then given again."""
@@ -57,7 +51,6 @@ class Controller:
     keeper     of its own clock, with trigger `clock`
     counters   late_samples     real time: periods in which no sample came in time
                reused_samples   trigger clock: steps for which no new sample was there, so that the last command stood
-               skipped_samples  trigger clock: samples of which a newer one was there by the time of the step
     """
 
     def __init__(
@@ -71,227 +64,154 @@ class Controller:
         spin_ns: int = 0,
         station: Station | None = None,
     ) -> None:
-        component = scenario.wire.emulator_component
-        self.law = law
-        self.state = law.start()
-        self.stop = stop
-        self.clock = clock
-        self.options = options
-        self.endpoint = Endpoint(link, *VEHICLE)
+        self._lockstep = lockstep = options.clock == "lockstep"
+        self.law, self.stop, self.clock, self.options = law, stop, clock, options
+        self.endpoint = endpoint = Endpoint(link, *VEHICLE)
         self.parameters = Parameters(scenario, lambda changed: law.adopt(make_law(law.name, changed)))
-        self.vehicle = Vehicle(self.endpoint, scenario.digest(), component, arm=options.arm, parameters=self.parameters)
-        self.station = GroundStation(station, self.vehicle, self.parameters) if station else None
-        self._look_ns = 0 if station else NEVER
-        self.telemetry = HilTelemetry(component)
-        lockstep = options.clock == "lockstep"
-        self.actuation = HilActuation(self.endpoint, self.vehicle, law.output.scale, clock, lockstep=lockstep)
-        self._quick = QuickAnswers(
-            law, self.state, self.endpoint, self.actuation.commands, component, lockstep=lockstep
+        self.time_sync = TimeSync(endpoint.seal, clock)
+        emulator = (VEHICLE[0], scenario.wire.emulator_component)
+        self.session = HilSession(
+            endpoint,
+            scenario.digest(),
+            emulator,
+            arm=options.arm,
+            parameters=self.parameters,
+            encoders=reference_encoders(law),
+            time_sync=None if lockstep else self.time_sync,
         )
-        self._patience_s = LOOK_PERIOD_S if lockstep else PATIENCE_PERIODS * scenario.period_ns * 1e-9
-        self._period_s = self._patience_s if lockstep else scenario.period_ns * 1e-9
-        self._lockstep = lockstep
-        self._spin_ns = spin_ns
-        self._due_ns = 0
-        self.keeper = RateKeeper(clock, scenario.period_ns, spin_ns) if options.trigger == "clock" else None
-        self._samples: deque[PositionSample] = deque()
-        self._silence_ns = 0
-        self._begun = self._was_armed = False
-        self.time_sync = TimeSync(self.endpoint.seal, clock)
+        self.source = HilSource(endpoint.reader, emulator)
+        self.keeper = RateKeeper(clock, law.period_ns, spin_ns) if options.trigger == "clock" else None
+        sink = HilSink(endpoint.writer, lockstep=lockstep)
+        self.tick = Tick(law, self.source, sink, self.session, endpoint.writer, self._send, at_once=self.keeper is None)
+        self.station = GroundStation(station, self.session, self.parameters) if station else None
         self.legs = LegTable(SAMPLE_COLUMNS) if options.legs else None
-        self._woke_ns = 0
-        self._came_ns = (0, 0)
+        self.counters = {"late_samples": 0, "reused_samples": 0}
+        self._look_ns = 0 if station else NEVER
+        self._patience_s = LOOK_PERIOD_S if lockstep else PATIENCE_PERIODS * law.period_ns * 1e-9
+        self._spin_ns = spin_ns
+        self._noted_ns = -1
+        self._due_ns = self._woke_ns = 0
         self._run_began_ns = clock.now_ns(), processor_time_ns()
-        self.counters = {"late_samples": 0, "reused_samples": 0, "skipped_samples": 0}
 
     def run(self) -> None:
         """Meet the emulator, then answer its samples until it says that the run is over."""
-        self._meet()
+        self.session.meet(self._listen, lambda: self.source.t_ns >= 0, self.clock, self.options.wait_s, self.stop)
         self._run_began_ns = self.clock.now_ns(), processor_time_ns()
-        read: Callable[[], PositionSample | None] = self._read
         if self.keeper:
             self.keeper.resume()  # where in the emulator's period this clock ticks is chance, as between two machines
-            read = functools.partial(self._read_by_clock, self.keeper)
-        while (sample := read()) or not self.vehicle.ended:
-            if sample is None or sample.t_ns == self.actuation.answered_ns:
-                self.actuation.repeat()
-                continue
-            armed = self.vehicle.armed
-            if not (armed and self._was_armed):
-                self.law.restart(self.state)  # what a disarmed law remembers never acted
-            self._was_armed = armed
-            tau = self.law.step(self.state, sample.t_ns, sample.q)
-            computed_ns = self.clock.now_ns()
-            self.actuation.publish(ActuatorCommand(sample.t_ns, tau, armed), self.state.desired)
-            self._note(sample.t_ns, computed_ns)
-            self._hear_station(sample.t_ns)
-            self._get_ready()
+        while not self.session.ended:
+            self.stop.check()
+            if self.keeper:
+                self._step_by_clock(self.keeper)
+            else:
+                self._step_by_sample()
 
-    def _hear_station(self, t_ns: int) -> None:
+    def _step_by_sample(self) -> None:
+        """Answer what comes next; in real time a sample that is late has the last command given again, each period."""
+        begun_ns = self.clock.now_ns()
+        self._ask_the_time(begun_ns)
+        late = self.session.is_silent and not self._lockstep
+        data = self._receive(self.law.period_ns * 1e-9 if late else self._patience_s)
+        if data:
+            self._take(data)
+            return
+        self._count_silence(begun_ns)
+        if not self._lockstep:
+            self.counters["late_samples"] += 1
+            self.tick.repeat()
+
+    def _step_by_clock(self, keeper: RateKeeper) -> None:
+        """At the next deadline of this end's own clock answer the newest sample, or give the last command again."""
+        begun_ns = self.clock.now_ns()
+        heard = False
+        while not self.session.ended and (wait_s := keeper.remaining_s()) is not None:
+            self.stop.check()
+            self._ask_the_time(begun_ns)
+            data = self._receive(wait_s)
+            if data:
+                self._take(data)
+                heard = True
+        if not heard:
+            self._count_silence(begun_ns)
+        if self.session.ended:
+            return
+        keeper.tick()
+        if self.tick.is_fresh:
+            self.tick.answer()
+        else:
+            self.counters["reused_samples"] += 1
+            self.tick.repeat()
+
+    def _listen(self, timeout_s: float) -> None:
+        """Hear the link and the station, before the first sample."""
+        data = self._receive(timeout_s)
+        if data:
+            self._take(data)
         if self.station:
-            self.station.poll_if_due(t_ns)
+            self.station.poll(0)
+
+    def _take(self, data: bytes) -> None:
+        """Have the tick take what came, then see to what can wait until the answer is on its way."""
+        self.session.heard()
+        self.tick.take(data)
+        if self.station and self.tick.answered_ns >= self._look_ns:
+            self.station.poll_if_due(self.tick.answered_ns)
             self._look_ns = self.station.next_ns
 
-    def _meet(self) -> None:
-        """Say hello until the first sample comes."""
-        give_up_ns = self.clock.now_ns() + round(self.options.wait_s * 1e9)
-        hello = Due(1.0 / HELLO_PERIOD_S)
-        said = False
-        while (now_ns := self.clock.now_ns()) < give_up_ns:
-            self.stop.check()
-            if hello.at(now_ns) or said != self.vehicle.agreed:
-                self.endpoint.send(self.vehicle.hello())
-                said = self.vehicle.agreed
-            self._look(HELLO_PERIOD_S)
-            if self.station:
-                self.station.poll(0)
-            if self._samples or self.vehicle.ended:
-                return
-        uri = self.endpoint.link.uri
-        if self.vehicle.agreed:
-            raise PeerMissingError(
-                f"the emulator at {uri} sent no tick within {self.options.wait_s:g} s: arm this controller with --arm"
-            )
-        raise PeerMissingError(
-            f"no emulator at {uri} within {self.options.wait_s:g} s: start one with `fwav-hil emulator SCENARIO "
-            f"--link {uri.replace('out://', 'in://', 1)}`, or wait longer with --wait"
-        )
-
-    def _read(self) -> PositionSample | None:
-        """The next sample; None where the run is over or, in real time, where none came in time."""
-        while not self._samples and not self.vehicle.ended:
-            self.stop.check()
-            begun_ns = self.clock.now_ns()
-            self._ask_the_time(begun_ns)
-            # Once a sample is late, the command that stands is given again each period.
-            if self._await(self._period_s if self._silence_ns else self._patience_s):
-                self._silence_ns = 0
-                continue
-            self._count_silence(begun_ns)
-            if not self._lockstep:
-                self.counters["late_samples"] += 1
-                return None
-        return self._samples.popleft() if self._samples else None
-
-    def _read_by_clock(self, keeper: RateKeeper) -> PositionSample | None:
-        """The newest sample at the next deadline of this end's own clock; None where the run is over or none is new."""
-        heard = False
-        begun_ns = self.clock.now_ns()
-        while not self.vehicle.ended and (wait_s := keeper.remaining_s()) is not None:
-            self.stop.check()
-            self._ask_the_time(begun_ns)
-            heard = self._look(wait_s) or heard
-        if heard:
-            self._silence_ns = 0
-        else:
-            self._count_silence(begun_ns)
-        if self.vehicle.ended:
-            return None
-        keeper.tick()
-        new = {sample.t_ns: sample for sample in self._samples if sample.t_ns > self.actuation.answered_ns}
-        self._samples.clear()
-        if not new:
-            self.counters["reused_samples"] += 1
-            return None
-        self.counters["skipped_samples"] += len(new) - 1
-        return new[max(new)]
+    def _send(self, answer: bytes) -> None:
+        """Send an answer, and note when it and its sample were where."""
+        link = self.endpoint.link
+        if not self.legs:
+            link.send(answer)
+            return
+        computed_ns = self.clock.now_ns()
+        link.send(answer)
+        t_ns = self.tick.answered_ns
+        if t_ns != self._noted_ns:
+            self._noted_ns = t_ns
+            self.legs.add(t_ns, link.received_ns, self._woke_ns, computed_ns, self.clock.now_ns())
 
     def _ask_the_time(self, now_ns: int) -> None:
         """Send a TIMESYNC, in real time, when one is due."""
-        if not self._lockstep and self._begun and now_ns >= self.time_sync.next_ns:
+        if not self._lockstep and self.source.t_ns >= 0 and now_ns >= self.time_sync.next_ns:
             self.endpoint.send([self.time_sync.question()])
 
     def _count_silence(self, begun_ns: int) -> None:
-        """Add up a wait in which nothing came. Raises PeerLostError after 3 s of them.
-
-        One by one: a stall of the whole machine then counts as one wait, not as silence.
-        """
+        """Count a wait, begun then, in which nothing came. Raises PeerLostError after 3 s of them."""
         if self.station:
-            self.station.poll(self.actuation.answered_ns)
-        self._silence_ns += min(self.clock.now_ns() - begun_ns, round(2e9 * self._patience_s))
-        if self._silence_ns > HEARTBEAT_TIMEOUT_NS:
-            raise PeerLostError(
-                f"the emulator at {self.endpoint.link.uri} fell silent for 3 s after t = "
-                f"{self.actuation.answered_ns * 1e-9:.3f} s: see whether it still runs"
-            )
+            self.station.poll(self.tick.answered_ns)
+        waited_ns = self.clock.now_ns() - begun_ns
+        self.session.count_silence(waited_ns, round(2e9 * self._patience_s), self.tick.answered_ns)
 
-    def _await(self, timeout_s: float) -> bool:
-        """`_look`, polling around the time at which the next sample is due."""
-        if not self._spin_ns or self._lockstep:
-            return self._look(timeout_s)
-        now_ns = self.clock.now_ns()
-        end_ns = now_ns + round(timeout_s * 1e9)
-        sleep_ns = self._due_ns - self._spin_ns - now_ns
-        if 0 < sleep_ns < end_ns - now_ns and self._look(sleep_ns * 1e-9):
-            return True
-        while self.clock.now_ns() < self._due_ns + self._spin_ns:
-            if self._look(0.0):
-                return True
-        return self._look(max(0, end_ns - self.clock.now_ns()) * 1e-9)
-
-    def _look(self, timeout_s: float) -> bool:
-        """Take what comes within the timeout; whether anything came."""
+    def _receive(self, timeout_s: float) -> bytes | None:
+        """What comes within the timeout, or None; in real time it polls around the time at which a sample is due."""
+        link, clock = self.endpoint.link, self.clock
         try:
-            data = self.endpoint.link.recv(timeout_s)
+            if self._lockstep:
+                return link.recv(timeout_s)
+            data = self._receive_punctually(timeout_s) if self._spin_ns else link.recv(timeout_s)
         except LinkClosedError:
-            if self.actuation.answered_ns < 0:
+            if self.tick.answered_ns < 0:
                 raise
             raise PeerLostError(
-                f"the emulator at {self.endpoint.link.uri} closed the link in the middle of the run: see why it ended"
+                f"the emulator at {link.uri} closed the link in the middle of the run: see why it ended"
             ) from None
-        if not data:
-            return False
-        if not self._lockstep:
-            self._woke_ns = self.clock.now_ns()
-        if self.keeper is None and self._answer_at_once(data):
-            return True
-        for frame in self.endpoint.reader.read(data):
-            if self.telemetry.is_telemetry(frame):
-                sample = self.telemetry.take(frame)
-                if sample is not None:
-                    if not self._begun:
-                        self._begun = True
-                        self.endpoint.reader.restart_sequences([(frame.system, frame.component, frame.sequence + 1)])
-                    self._samples.append(sample)
-                    self._note_arrival()
-            elif frame.message_id == mapping.TIMESYNC.message_id and not self._lockstep:
-                answer = self.time_sync.take(frame, self.endpoint.link.received_ns or self._woke_ns)
-                if answer:
-                    self.endpoint.send([answer])
-            else:
-                self.vehicle.take(frame)
-        self._get_ready()
-        return True
+        self._woke_ns = clock.now_ns()
+        self._due_ns = self._woke_ns + self.law.period_ns if data else self._due_ns
+        return data
 
-    def _answer_at_once(self, data: bytes) -> bool:
-        """Answer a plain sample on the short way; False, with nothing done, where it is not one."""
-        t_ns, answer = self._quick.to(data)
-        if t_ns < 0:
-            return False
-        self._note_arrival()
-        computed_ns = self.clock.now_ns() if self.legs else 0
-        self.actuation.send(t_ns, answer)
-        self._note(t_ns, computed_ns)
-        self.telemetry.taken(t_ns)
-        self._get_ready()
-        return True
-
-    def _note_arrival(self) -> None:
-        """Note when the sample just read came, and so when the next one is due."""
-        self._due_ns = self._woke_ns + self.law.period_ns
-        if self.legs:
-            self._came_ns = (self.endpoint.link.received_ns, self._woke_ns)
-
-    def _note(self, t_ns: int, computed_ns: int) -> None:
-        """Note when the sample of t_ns and its command, just sent, were where."""
-        if self.legs:
-            self.legs.add(t_ns, *self._came_ns, computed_ns, self.actuation.sent_ns)
-
-    def _get_ready(self) -> None:
-        """Say which samples may be answered at once: those after the last one, while armed and nothing else is due."""
-        armed = self._was_armed and self.vehicle.armed and not self._samples
-        quiet_until_ns = min(self.actuation.quiet_until_ns, self._look_ns) if armed else 0
-        self._quick.get_ready(self.actuation.answered_ns, quiet_until_ns)
+    def _receive_punctually(self, timeout_s: float) -> bytes | None:
+        """`Link.recv`, polling from shortly before to shortly after the time at which the next sample is due."""
+        recv, now_ns = self.endpoint.link.recv, self.clock.now_ns
+        begun_ns = now_ns()
+        end_ns = begun_ns + round(timeout_s * 1e9)
+        sleep_ns = self._due_ns - self._spin_ns - begun_ns
+        if 0 < sleep_ns < end_ns - begun_ns and (data := recv(sleep_ns * 1e-9)):
+            return data
+        while now_ns() < self._due_ns + self._spin_ns:
+            if data := recv(0.0):
+                return data
+        return recv(max(0, end_ns - now_ns()) * 1e-9)
 
     def processor_share(self) -> float:
         """The share of a core that the run has taken since its first sample."""
@@ -302,32 +222,28 @@ class Controller:
         """Everything counted at this end, by name."""
         return {
             **self.endpoint.counters(),
-            **self.telemetry.counters,
-            **self.actuation.counters,
-            **self.law.counts(self.state),
+            **self.source.counters(),
+            **self.tick.counters,
+            **self.law.counts(self.tick.state),
             **self.counters,
-            **self.vehicle.requests.counters,
+            **self.session.requests.counters,
             **self.parameters.counters,
             **(self.station.counters() if self.station else {}),
             **(self.keeper.counters if self.keeper else {}),
         }
 
 
-def warm_up(law: Law) -> None:
+def warm_up(scenario: Scenario, law: Law) -> None:
     """Have every kernel of the loop compiled (or loaded) before the emulator waits for an answer."""
-    mapping.decode_pose(mapping.encode_pose(0, np.zeros(6)))
-    mapping.encode_attitude_target(0, np.zeros(6))
-    state = law.start()
-    command = ActuatorCommand(0, law.step(state, 0, np.zeros(6)), armed=True)
     near, far = memory_pair()
     with near, far:
         endpoint = Endpoint(near, *VEHICLE)
-        commands = CommandWriter(endpoint.writer, law.output.scale, lockstep=True)
-        commands.frame(command)
-        endpoint.reader.expect(VEHICLE, 0)
-        quick = QuickAnswers(law, state, endpoint, commands, VEHICLE[1], lockstep=True)
-        quick.get_ready(-1, 0)
-        quick.to(b"")
+        pose = endpoint.seal(mapping.POSE, mapping.encode_pose(0, np.zeros(6)))
+        tick = endpoint.seal(mapping.TICK, mapping.encode_tick(0, np.zeros(13)))
+        source = HilSource(endpoint.reader, VEHICLE)
+        sink = HilSink(endpoint.writer, lockstep=True)
+        session = HilSession(endpoint, scenario.digest(), VEHICLE, arm=False, encoders=reference_encoders(law))
+        Tick(law, source, sink, session, endpoint.writer, near.send).take(pose + tick)
 
 
 def run_controller(scenario: Scenario, options: ControllerOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
@@ -341,7 +257,7 @@ def run_controller(scenario: Scenario, options: ControllerOptions, report: Repor
         raise UsageError("--legs notes times of a real-time run in a folder: add --clock realtime and --out DIR")
     if options.out:
         take_folder(options.out, RESULT, CONTROLLER_FILE)
-    warm_up(law)
+    warm_up(scenario, law)
     uri = _told_link() if options.link == "-" else options.link
     report({"event": "waiting", "link": uri})
     with open_patiently(uri, options.wait_s, stop) as link:
@@ -371,7 +287,7 @@ def serve(
     error: FwavHilError | None = None
     with (
         open_station(
-            options.station, VEHICLE, lambda: mapping.encode_controller_heartbeat(armed=controller.vehicle.armed),
+            options.station, VEHICLE, lambda: mapping.encode_controller_heartbeat(armed=controller.session.armed),
             options.out / STATION_FILE if options.out else None, options.wait_s, stop,
         ) as station,
         maybe_real_time(options.core, wanted=options.realtime) as settings,

@@ -18,5 +18,5 @@ def compile_kernels(scenario: Scenario) -> None:
     from controller.laws.law import make_law
 
     plant_emulator.process.warm_up(scenario)
-    controller.process.warm_up(make_law(scenario.law, scenario))
+    controller.process.warm_up(scenario, make_law(scenario.law, scenario))
     mark_warm()

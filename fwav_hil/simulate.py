@@ -11,17 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from controller.laws.law import Law, control_step, make_law
-from plant_emulator.plant.integrate import (
-    GOES_ON,
-    TOO_MANY_PENDING,
-    Plant,
-    advance,
-    apply_due_commands,
-    divergence_sentence,
-    push_command,
-)
-from plant_emulator.plant.safety import clamp
+from plant_emulator.plant.integrate import GOES_ON, TOO_MANY_PENDING, Plant, divergence_sentence, record_and_advance
+from plant_emulator.plant.safety import SafetyEnvelope
 from plant_emulator.plant.sensors import PositionSensor, add_noise
+from plant_emulator.tick import act
 from protocol.compiled import Packed, compiled
 from protocol.errors import UsageError
 from protocol.messages import FloatArray
@@ -35,20 +28,21 @@ def _loop(
     packed_law_state: Packed,
     packed_plant: Packed,
     parameters: Packed,
+    packed_envelope: Packed,
     delays_ns: np.typing.NDArray[np.int64],
     normal: FloatArray,
     position_noise: float,
     attitude_noise: float,
     rows: FloatArray,
 ) -> tuple[int, int]:
-    """Run len(rows) ticks; row k is q, q', command, tau, u (30 numbers) at t_k. Returns (rows made, outcome).
+    """Run len(rows) ticks; row k is that of the ground truth at t_k. Returns (rows made, outcome).
 
     The command of tick k acts delays_ns[k] later, but never before the one of the tick before; where that is negative it
     never does.
     """
-    law, law_state, plant, body = packed_law[0], packed_law_state[0], packed_plant[0], parameters[0]
-    period_ns = law.period_ns
-    measured, seen, wire, allowed = np.empty(6), np.empty(6), np.empty(7), np.empty(6)
+    law, law_state, plant = packed_law[0], packed_law_state[0], packed_plant[0]
+    body, envelope, period_ns = parameters[0], packed_envelope[0], law.period_ns
+    measured, seen, wire = np.empty(6), np.empty(6), np.empty(7)
     acts_ns = 0
     for k in range(rows.shape[0]):
         t_ns = k * period_ns
@@ -56,18 +50,11 @@ def _loop(
         pose_to_wire(measured, wire)
         pose_from_wire(wire, seen)
         control_step(law, law, law, period_ns, law_state, t_ns, seen, plant.motion[6:])
-        clamp(law_state.tau, law.lower, law.upper, allowed)
         if delays_ns[k] >= 0:
             acts_ns = max(acts_ns, t_ns + delays_ns[k])
-            if not push_command(plant, acts_ns, allowed):
+            if not act(envelope, plant, t_ns, acts_ns, law_state.tau, True):
                 return k, TOO_MANY_PENDING
-        apply_due_commands(plant, body, t_ns)
-        row = rows[k]
-        row[:12] = plant.motion
-        row[12:18] = law_state.tau
-        row[18:24] = plant.tau
-        row[24:30] = plant.u
-        outcome = advance(plant, body, body, t_ns, t_ns + period_ns, body.substep_ns)
+        outcome = record_and_advance(plant, body, t_ns, t_ns + period_ns, law_state.tau, rows[k])
         if outcome != GOES_ON:
             return k + 1, outcome
     return rows.shape[0], GOES_ON
@@ -105,13 +92,14 @@ def simulate(
     law = law or make_law(scenario.law, scenario)
     plant = Plant(scenario)
     state = law.start()
-    rows = np.empty((scenario.ticks, 30))
-    normal = PositionSensor(scenario.noise, scenario.seed).draw(scenario.ticks)
+    rows = np.empty((scenario.ticks, 31))
+    normal = PositionSensor(scenario.seed).draw(scenario.ticks)
     count, outcome = _loop(
         law.packed,
         state.packed,
         plant.state.packed,
         plant.parameters,
+        SafetyEnvelope(scenario.actuators).packed,
         np.ascontiguousarray(delays_ns, dtype=np.int64),
         normal,
         scenario.noise.position,
@@ -122,11 +110,11 @@ def simulate(
     t_ns = np.arange(count, dtype=np.int64) * scenario.period_ns
     return Simulation(
         t_ns=t_ns,
-        q=rows[:, :6],
-        q_dot=rows[:, 6:12],
-        command=rows[:, 12:18],
-        tau=rows[:, 18:24],
-        u=rows[:, 24:],
+        q=rows[:, 1:7],
+        q_dot=rows[:, 7:13],
+        command=rows[:, 13:19],
+        tau=rows[:, 19:25],
+        u=rows[:, 25:],
         law_counts=law.counts(state),
         divergence=None if outcome == GOES_ON else divergence_sentence(outcome, count * scenario.period_ns),
     )

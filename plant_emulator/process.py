@@ -24,7 +24,6 @@ from bridge.summary import make_folder, percentiles_us, refuse_existing_run, wri
 from bridge.timing.clock import MonotonicClock, processor_time_ns
 from bridge.timing.rate import RateKeeper, choose_spin_ns
 from bridge.timing.realtime import Settings, has_own_core, maybe_real_time, report_settings
-from plant_emulator.emulator import Emulator
 from plant_emulator.options import EmulatorOptions
 from plant_emulator.pacing.lockstep import Lockstep
 from plant_emulator.pacing.meeting import meet_autopilot, meet_controller
@@ -32,6 +31,7 @@ from plant_emulator.pacing.pacing import Pacing, Parts
 from plant_emulator.pacing.real_time import RealTime
 from plant_emulator.pacing.tolerant import Tolerant
 from plant_emulator.plant.truth import TruthWriter
+from plant_emulator.tick import Emulator
 from protocol.errors import FwavHilError, RunFolderError, UsageError
 from protocol.logs.tlog import TlogWriter
 from protocol.messages import VEHICLE, ActuatorCommand
@@ -96,15 +96,15 @@ def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report
         ):
             emulator = Emulator(scenario, endpoint, truth, motors, station)
             if options.truth_hz:
-                emulator.on_request.ask_for_truth(options.truth_hz)
+                emulator.say_truth(options.truth_hz)
             report_settings(report, settings)
-            parts = Parts(emulator, endpoint, log, MonotonicClock(), stop, scenario.period_ns)
+            parts = Parts(emulator, endpoint, log, MonotonicClock(), stop, scenario.period_ns, scenario.ticks)
             pacing = _pacing(scenario, options, parts, settings)
             report({"event": "waiting", "link": link.uri})
             if isinstance(pacing, Tolerant):
-                meet_autopilot(options.wait_s, endpoint, stop, emulator.on_request)
+                meet_autopilot(options.wait_s, endpoint, stop, emulator)
             else:
-                meet_controller(scenario, options.wait_s, endpoint, stop, emulator.on_request)
+                meet_controller(scenario, options.wait_s, endpoint, stop, emulator)
             report({"event": "started", "peer": link.peer})
             if options.legs and isinstance(pacing, RealTime):
                 pacing.legs = LegTable(TICK_COLUMNS), LegTable(ANSWER_COLUMNS)
@@ -155,13 +155,19 @@ def warm_up(scenario: Scenario) -> None:
     """Have every kernel of a run compiled (or loaded) before a controller waits for an answer."""
     near, far = memory_pair()
     with near, far:
-        emulator = Emulator(scenario, Endpoint(near, *VEHICLE), None)
+        endpoint = Endpoint(near, *VEHICLE)
+        emulator = Emulator(scenario, endpoint, None)
         emulator.sense(0)
-        command = ActuatorCommand(0, np.zeros(6), armed=True)
-        emulator.decode(mapping.encode_command(command, np.ones(6), lockstep=True))
-        emulator.act(0, 0, command)
+        emulator.source.feed(
+            endpoint.seal(
+                mapping.COMMAND,
+                mapping.encode_command(ActuatorCommand(0, np.zeros(6), armed=True), np.ones(6), lockstep=True),
+            )
+        )
+        emulator.source.read()
+        emulator.act(0, 0)
+        emulator.check_staleness(0)
         emulator.advance(scenario.period_ns)
-        emulator.go_on(b"", 0, 1, 0)
 
 
 def _motors(
@@ -188,13 +194,11 @@ def _pacing(scenario: Scenario, options: EmulatorOptions, parts: Parts, settings
     if options.clock == "realtime":
         spin_ns = choose_spin_ns(parts.clock, scenario.period_ns, options.spin_s, measure=has_own_core(settings))
         through = not options.motors and parts.endpoint.link.stamp_receives()  # drives on a bus are told at once
-        return RealTime(
-            parts, ticks=scenario.ticks, spin_ns=spin_ns, sleeps_through=through, added_delay_ns=options.delay_ns
-        )
+        return RealTime(parts, spin_ns=spin_ns, sleeps_through=through, added_delay_ns=options.delay_ns)
     keeper = RateKeeper(parts.clock, round(scenario.period_ns / options.speed)) if options.speed else None
     if options.profile == "tolerant":
-        return Tolerant(parts, ticks=scenario.ticks, delay_ns=scenario.delay_ns, keeper=keeper, wait_s=options.wait_s)
-    return Lockstep(parts, ticks=scenario.ticks, delay_ns=scenario.delay_ns, keeper=keeper)
+        return Tolerant(parts, delay_ns=scenario.delay_ns, keeper=keeper, wait_s=options.wait_s)
+    return Lockstep(parts, delay_ns=scenario.delay_ns, keeper=keeper)
 
 
 def _heartbeat() -> bytes:
@@ -213,7 +217,7 @@ def _run_ticks(
     try:
         for tick in range(scenario.ticks):
             t_ns = tick * period_ns
-            pacing.exchange(tick, t_ns)
+            pacing.exchange(t_ns)
             done = tick + 1
             now_ns = clock.now_ns()
             ticks_ns.append(now_ns - last_ns)

@@ -66,23 +66,35 @@ def _compile(function: Kernel, *, forceinline: bool) -> Kernel:
 
 
 @functools.cache
-def _structure(kinds: tuple[tuple[str, str, tuple[int, ...]], ...]) -> np.dtype[np.void]:
+def _structure(
+    kinds: tuple[tuple[str, str, tuple[int, ...]], ...], messages: tuple[tuple[str, np.dtype[np.void]], ...]
+) -> np.dtype[np.void]:
     """One dtype object for each layout: numba knows the one it has met at once, but compares an equal one field by field.
 
     That costs some microseconds for each argument of each call.
     """
-    return np.dtype(list(kinds))
+    columns = [(name, np.dtype((kind, shape))) for name, kind, shape in kinds]
+    offsets = np.cumsum([0, *(kind.itemsize for _, kind in columns)]).tolist()
+    at = offsets.pop()
+    for name, message in messages:
+        columns += [(name, message), (f"{name}_bytes", np.dtype(("u1", (message.itemsize,))))]
+        offsets += [at, at]  # the same memory twice: by field, and byte by byte
+        at += message.itemsize
+    return np.dtype(
+        {"names": [name for name, _ in columns], "formats": [kind for _, kind in columns], "offsets": offsets}
+    )
 
 
-def pack(values: Mapping[str, Any]) -> Packed:
+def pack(values: Mapping[str, Any], messages: Mapping[str, np.dtype[np.void]] | None = None) -> Packed:
     """Arrays, numbers and truth values by name, copied into one structured array of shape (1,).
 
     A kernel that is called from Python takes one array at once far sooner than a dozen. Inside a kernel `packed[0]` is
-    read by the same names as a NamedTuple's fields, so a function takes either.
+    read by the same names as a NamedTuple's fields, so a function takes either. A message NAME (the dtype of its payload) is
+    there as NAME, field by field, and as NAME_bytes.
     """
     columns = [(name, np.asarray(value)) for name, value in values.items()]
     kinds = tuple((name, "i8" if array.dtype == bool else array.dtype.str, array.shape) for name, array in columns)
-    packed = np.zeros(1, dtype=_structure(kinds))
+    packed = np.zeros(1, dtype=_structure(kinds, tuple((messages or {}).items())))
     for name, array in columns:
         packed[name][0] = array
     return packed

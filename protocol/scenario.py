@@ -20,6 +20,7 @@ import msgspec
 import tomli_w
 from msgspec import Meta
 
+from protocol import due
 from protocol.errors import ScenarioError
 from protocol.messages import AXES, FloatArray
 
@@ -32,7 +33,7 @@ Positive6: TypeAlias = tuple[Positive, Positive, Positive, Positive, Positive, P
 NotNegative6: TypeAlias = tuple[NotNegative, NotNegative, NotNegative, NotNegative, NotNegative, NotNegative]
 
 ZERO6: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-NANOSECONDS = 1_000_000_000
+NANOSECONDS = due.NANOSECONDS
 LONGEST_S = 4_000_000.0
 """The longest time in a scenario: 46 days; the wire counts milliseconds in 32 bits."""
 

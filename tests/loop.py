@@ -64,7 +64,7 @@ def fly_both(
     )  # fmt: skip
     law = make_law(theirs.law, theirs)
     plant_emulator.process.warm_up(scenario)
-    controller_process.warm_up(law)
+    controller_process.warm_up(theirs, law)
     with ThreadPoolExecutor(2) as threads:
         flight = threads.submit(lambda: fly(scenario, emulator_link, emulator, _silent, StopFlag()))
         service = threads.submit(lambda: serve(theirs, law, controller_link, service_options, _silent, StopFlag()))

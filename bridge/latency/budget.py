@@ -17,7 +17,8 @@ import numpy as np
 from bridge.links.link import LinkUri, parse_link_uri
 from protocol.messages import VEHICLE, ActuatorCommand
 from protocol.wire import mapping
-from protocol.wire.codec import CRC_SIZE, HEADER_V2, FrameWriter, layout
+from protocol.wire.codec import FrameWriter, layout
+from protocol.wire.framing import CRC_SIZE, HEADER_V2
 from protocol.wire.streams import STREAMS, End, Stream
 
 BITS_PER_BYTE = 10

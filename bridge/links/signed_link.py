@@ -50,8 +50,8 @@ class SignedLink(WrappedLink):
         plain: list[bytes] = []
         now_us = unix_time_us()
         for frame in self._incoming.read(data):
-            verdict = self._signatures.verify(frame, now_us)
-            stripped = strip(frame) if verdict is Verdict.GOOD else None
+            verdict = self._signatures.verify(frame.raw, now_us)
+            stripped = strip(frame.raw) if verdict is Verdict.GOOD else None
             if stripped is not None:
                 plain.append(stripped)
             else:
@@ -71,7 +71,7 @@ class SignedLink(WrappedLink):
     def send(self, data: bytes | bytearray | memoryview) -> None:
         """Send the frames of `data`, each signed anew."""
         now_us = unix_time_us()
-        self._link.send(b"".join(self._signatures.sign(one, now_us) for one in self._outgoing.read(bytes(data))))
+        self._link.send(b"".join(self._signatures.sign(one.raw, now_us) for one in self._outgoing.read(bytes(data))))
 
     def release_peer(self) -> None:
         """As the link does; whoever comes next must be believed anew."""

@@ -19,6 +19,7 @@ from protocol.messages import VEHICLE
 from protocol.scenario import NANOSECONDS
 from protocol.wire import mapping
 from protocol.wire.requests import CAN_FORWARD, Request, Result, wanted_bus
+from protocol.wire.schedule import Schedule
 
 RENEW_NS: Final = 5 * NANOSECONDS
 _MOST_AT_ONCE = 64
@@ -37,7 +38,8 @@ class CanTap:
     def __init__(self, link: Link, component: int, clock: Clock) -> None:
         who = (VEHICLE[0], component)
         self._station = Station(link, who, clock, mapping.encode_emulator_heartbeat)
-        self._requests = Requests(who, {}, {CAN_FORWARD: self._forward})
+        self._answers = Schedule({})
+        self._requests = Requests(who, self._answers, (), {CAN_FORWARD: self._forward})
         self._clock = clock
         self._until_ns: int | None = None
         self._departures = 0
@@ -77,7 +79,7 @@ class CanTap:
             else:
                 self._requests.take(message)
         self.counters["tap_refused"] += self._requests.counters["requests_refused"] - refused
-        for saying in self._requests.due(0, lambda _number, _t_ns: ()):
+        for saying in self._answers.answers():
             self._station.say(*saying)
         return frames
 

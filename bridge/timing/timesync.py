@@ -64,7 +64,8 @@ class TimeSync:
         return self._seal(mapping.TIMESYNC, mapping.encode_timesync(0, now_ns))
 
     def take(self, frame: Frame, arrived_ns: int) -> bytes | None:
-        """Take a TIMESYNC that came at arrived_ns; the frame to answer a question with, else None."""
+        """Take a TIMESYNC that came at arrived_ns (0: now); the frame to answer a question with, else None."""
+        arrived_ns = arrived_ns or self._clock.now_ns()
         answer_ns, asked_ns = mapping.decode_timesync(frame.payload)
         if answer_ns == 0:
             payload = mapping.encode_timesync(self._clock.now_ns(), asked_ns)

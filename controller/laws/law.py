@@ -99,8 +99,8 @@ def _start_axis(axis: int, law: Realisation, state: LawState, uhat: float) -> No
 
 
 @compiled
-def _advance(law: Realisation, state: LawState) -> None:
-    """x_(k+1) from x_k, in place."""
+def _step_states(law: Realisation, state: LawState) -> None:
+    """x_(k+1) from x_k and the inputs r, in place."""
     order = state.x.shape[1]
     following = state.scratch[2]
     for axis in range(6):
@@ -116,67 +116,53 @@ def _advance(law: Realisation, state: LawState) -> None:
 
 
 @compiled
-def _catch_up(
-    periods: int,
-    period_ns: int,
-    law: Realisation,
-    reference: ReferenceParameters,
-    state: LawState,
-    q: FloatArray,
-    velocity: FloatArray,
-) -> None:
-    """Step through the periods of which no sample came: q linear between its neighbours, tau held."""
-    between = state.scratch[1]
-    for missing in range(1, periods):
-        t_ns = state.t_ns[0] + missing * period_ns
-        evaluate_reference(t_ns * 1e-9, reference, state.desired[0], state.desired[1], state.desired[2])
-        for axis in range(6):
-            between[axis] = state.q[axis] + (q[axis] - state.q[axis]) * (missing / periods)
-        _inputs(between, velocity, state.desired, state.r)
-        _advance(law, state)
+def begin_sample(law: Realisation, period_ns: int, state: LawState, t_ns: int, measured: FloatArray) -> int:
+    """Take the sample `measured` (6,) of time t_ns, its angles unwrapped; returns the periods since the last one.
 
-
-@compiled
-def control_step(
-    law: Realisation,
-    output: Output,
-    reference: ReferenceParameters,
-    period_ns: int,
-    state: LawState,
-    t_ns: int,
-    measured: FloatArray,
-    velocity: FloatArray,
-) -> None:
-    """One step of the law on the sample `measured` (6,) of time t_ns; the command is then in state.tau (6,).
-
-    Periods without a sample since the last step are stepped all at once (q linear, tau held); after a gap of an axis's
-    memory_s or more that axis starts again from its last estimate. Periods are counted from the first sample on: one that
-    comes before the next of them is due by half changes nothing, the command stands. `velocity` (6,) is read by
-    state-feedback laws only.
+    0: the sample comes before its period is due by half, so nothing changes and the command stands. Periods are counted
+    from the first sample on, which begins the law's own time.
     """
-    q, r = state.scratch[0], state.r
     first = state.fresh[0] != 0
     periods = 1
-    for i in range(3):
-        q[i] = measured[i]
-        q[3 + i] = measured[3 + i] if first else unwrap_angle(measured[3 + i], state.q[3 + i])
     if not first:
         periods = (t_ns - state.t_ns[0] + period_ns // 2) // period_ns
         if periods < 1:
-            return
-        if periods > 1:
-            state.counts[1] += periods - 1
-            if periods * period_ns * 1e-9 < law.memory_s.max():
-                _catch_up(periods, period_ns, law, reference, state, q, velocity)
+            return 0
+        state.counts[1] += periods - 1
+    for i in range(3):
+        state.scratch[0, i] = measured[i]
+        state.scratch[0, 3 + i] = measured[3 + i] if first else unwrap_angle(measured[3 + i], state.q[3 + i])
+    return int(periods)
 
-    evaluate_reference(t_ns * 1e-9, reference, state.desired[0], state.desired[1], state.desired[2])
-    gap_s = periods * period_ns * 1e-9
+
+@compiled
+def coast(law: Realisation, state: LawState, part: float, velocity: FloatArray) -> None:
+    """Step through a period of which no sample came: q on the line from the last sample to this one, at `part` of it.
+
+    tau is held. state.desired holds the reference at the end of that period.
+    """
+    between = state.scratch[1]
+    for axis in range(6):
+        between[axis] = state.q[axis] + (state.scratch[0, axis] - state.q[axis]) * part
+    _inputs(between, velocity, state.desired, state.r)
+    _step_states(law, state)
+
+
+@compiled
+def law_output(law: Realisation, state: LawState, gap_s: float, velocity: FloatArray) -> None:
+    """What the law asks for upon the sample begun, inertial frame, in state.tau; its estimate in state.uhat.
+
+    state.desired (3, 6) holds the reference at the time of the sample. An axis whose memory_s the gap reaches starts again
+    from its last estimate; every axis does at the first sample, from uhat0.
+    """
+    first = state.fresh[0] != 0
     restarted = False
-    _inputs(q, velocity, state.desired, r)
+    r = state.r
+    _inputs(state.scratch[0], velocity, state.desired, r)
     for axis in range(6):
         if first:
             _start_axis(axis, law, state, law.uhat0[axis])
-        elif periods > 1 and gap_s >= law.memory_s[axis]:
+        elif gap_s >= law.memory_s[axis]:
             _start_axis(axis, law, state, state.uhat[axis])
             restarted = True
         uhat = 0.0
@@ -192,6 +178,21 @@ def control_step(
     if restarted:
         state.counts[2] += 1
 
+
+@compiled
+def law_advance(law: Realisation, period_ns: int, state: LawState, t_ns: int, periods: int) -> None:
+    """Move on to the next period; state.applied (6,) holds what really acts until then, inertial frame."""
+    _step_states(law, state)
+    for axis in range(6):
+        state.q[axis] = state.scratch[0, axis]
+    state.t_ns[0] = t_ns if state.fresh[0] != 0 else state.t_ns[0] + periods * period_ns
+    state.fresh[0] = 0
+    state.counts[0] += 1
+
+
+@compiled
+def limit_on_the_wire(output: Output, state: LawState, measured: FloatArray) -> None:
+    """Turn state.tau into the body frame and into what HIL_ACTUATOR_CONTROLS carries of it; that acts: state.applied."""
     tau = state.tau
     alpha, beta, gamma = measured[3], measured[4], measured[5]
     if output.rotate_force:
@@ -209,12 +210,37 @@ def control_step(
             alpha, beta, gamma, tau[0], tau[1], tau[2]
         )
 
-    _advance(law, state)
-    for axis in range(6):
-        state.q[axis] = q[axis]
-    state.t_ns[0] = t_ns if first else state.t_ns[0] + periods * period_ns
-    state.fresh[0] = 0
-    state.counts[0] += 1
+
+@compiled
+def control_step(
+    law: Realisation,
+    output: Output,
+    reference: ReferenceParameters,
+    period_ns: int,
+    state: LawState,
+    t_ns: int,
+    measured: FloatArray,
+    velocity: FloatArray,
+) -> None:
+    """One step of the law on the sample `measured` (6,) of time t_ns; the command is then in state.tau (6,), body frame.
+
+    The reference comes in as data, the output stands apart from the advance with what really acts: another sink puts its
+    own limits between the two. Periods without a sample are stepped all at once before (q linear, tau held), unless the gap
+    is as long as the longest memory_s. `velocity` (6,) is read by state-feedback laws only.
+    """
+    periods = begin_sample(law, period_ns, state, t_ns, measured)
+    if periods < 1:
+        return
+    gap_s = periods * period_ns * 1e-9 if periods > 1 else 0.0
+    if gap_s < law.memory_s.max():
+        for missing in range(1, periods):
+            then_s = (state.t_ns[0] + missing * period_ns) * 1e-9
+            evaluate_reference(then_s, reference, state.desired[0], state.desired[1], state.desired[2])
+            coast(law, state, missing / periods, velocity)
+    evaluate_reference(t_ns * 1e-9, reference, state.desired[0], state.desired[1], state.desired[2])
+    law_output(law, state, gap_s, velocity)
+    limit_on_the_wire(output, state, measured)
+    law_advance(law, period_ns, state, t_ns, periods)
 
 
 @compiled

@@ -1,63 +1,46 @@
-"""Where commands go: HIL_ACTUATOR_CONTROLS to the emulator, with what else is due travelling in front of it."""
+"""Commands to the emulator: HIL_ACTUATOR_CONTROLS, which echo the time of the sample that they answer, in compiled code."""
 
 from __future__ import annotations
 
-from bridge.endpoint import Endpoint
-from bridge.timing.clock import Clock
-from controller.vehicle import Vehicle
-from protocol.messages import ActuatorCommand, FloatArray
-from protocol.wire import mapping
-from protocol.wire.streams import Due, stream
-from protocol.wire.tick_frames import CommandWriter
+import numpy as np
+
+from controller.laws.law import Law, LawState, control_step
+from controller.sinks.sink import CommandSink
+from protocol.compiled import Packed, compiled, pack
+from protocol.messages import FloatArray
+from protocol.wire.codec import FrameWriter
+from protocol.wire.framing import LONGEST_FRAME, Output
+from protocol.wire.mapping import COMMAND
+from protocol.wire.tick_frames import write_command
 
 
-class HilActuation:
-    """Publishes commands, and the reference for the log; keeps the last answer, to give it again.
+@compiled
+def answer(
+    law: Packed, state: Packed, q: FloatArray, sink: Packed, t_ns: int, armed: bool, sequence: int, system: int,
+    component: int,
+) -> int:  # fmt: skip
+    """Step the law on q (6,), write the frame of its command into the sink's memory; returns where it ends."""
+    data, memory = law[0], sink[0]
+    control_step(data, data, data, data.period_ns, state[0], t_ns, q, memory.no_velocity)
+    return write_command(memory, t_ns // 1000, state[0].tau, data.scale, armed, sequence, system, component)
 
-    sent_ns    when the last answer was handed to the link, on the clock
 
-    counters   repeated  answers given again, because their tick came again or the next one is missing
-    """
+class HilSink(CommandSink):
+    """One frame for each sample, also when disarmed (zeros then)."""
 
-    def __init__(
-        self, endpoint: Endpoint, vehicle: Vehicle, scale: FloatArray, clock: Clock, *, lockstep: bool
-    ) -> None:
-        self._endpoint = endpoint
-        self._vehicle = vehicle
-        self.commands = CommandWriter(endpoint.writer, scale, lockstep=lockstep)
-        self._reference = Due(stream("POSITION_TARGET_LOCAL_NED").rate_hz or 1.0)
-        self._clock = clock
-        self._last = b""
-        self.sent_ns = 0
-        self.answered_ns = -1
-        self.counters = {"repeated": 0}
+    def __init__(self, writer: FrameWriter, *, lockstep: bool) -> None:
+        self._writer = writer
+        self._memory = pack(
+            {"no_velocity": np.zeros(6), "lockstep": lockstep, "out": np.zeros(LONGEST_FRAME, dtype=np.uint8)},
+            {"command": COMMAND.dtype},
+        )
+        self._out: Output = self._memory["out"][0]
 
-    def publish(self, command: ActuatorCommand, desired: FloatArray) -> None:
-        """Answer the sample of command.t_ns; desired (3, 6) is q_d, q_d', q_d'' at that time."""
-        seal, t_ns = self._endpoint.seal, command.t_ns
-        if self.answered_ns < 0:
-            self._endpoint.writer.sequence = 0  # the numbers of the run begin with its first answer
-        frames = self._vehicle.due_frames(t_ns)
-        if self._reference.at(t_ns):
-            frames.append(seal(mapping.POSITION_TARGET, mapping.encode_position_target(t_ns, *desired)))
-            frames.append(seal(mapping.ATTITUDE_TARGET, mapping.encode_attitude_target(t_ns, desired[0])))
-        frames.append(self.commands.frame(command))
-        self.send(t_ns, b"".join(frames))
-
-    def send(self, t_ns: int, answer: bytes) -> None:
-        """Send the whole answer to the sample of t_ns, and keep it."""
-        self._last = answer
-        self.answered_ns = t_ns
-        self.sent_ns = self._clock.now_ns()
-        self._endpoint.link.send(answer)
-
-    @property
-    def quiet_until_ns(self) -> int:
-        """An answer to a sample before this time is the command alone."""
-        return min(self._vehicle.quiet_until_ns, self._reference.next_ns)
-
-    def repeat(self) -> None:
-        """Give the last answer again, the same bytes, without a step of the law."""
-        if self._last:
-            self.counters["repeated"] += 1
-            self._endpoint.link.send(self._last)
+    def answer(self, law: Law, state: LawState, t_ns: int, q: FloatArray, *, armed: bool) -> bytes:
+        """Step the law on the sample q (6,) of time t_ns; returns the frame of the command."""
+        writer = self._writer
+        end = answer(
+            law.packed, state.packed, q, self._memory, t_ns, armed, writer.sequence, writer.system, writer.component
+        )
+        writer.sequence = (writer.sequence + 1) & 0xFF
+        return self._out[:end].tobytes()

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from bridge.requests import Requests, Saying
+from bridge.requests import Requests
 from bridge.station import POLL_HZ, Station
 from controller.parameters import Parameters
+from controller.session import OFFERED, HilSession
 from controller.station.parameter_server import ParameterServer
-from controller.vehicle import Vehicle
-from protocol.messages import VEHICLE
-from protocol.wire import mapping
+from protocol.due import Due
 from protocol.wire.file_transfer import FILE_TRANSFER, encode_refusal
+from protocol.wire.mapping import VERSION
 from protocol.wire.requests import REQUEST_CAPABILITIES, Request, Result
-from protocol.wire.streams import Due
+from protocol.wire.schedule import Schedule
 
 
 class GroundStation:
@@ -20,13 +20,16 @@ class GroundStation:
     next_ns   simulation time at which to poll next
     """
 
-    def __init__(self, station: Station, vehicle: Vehicle, parameters: Parameters) -> None:
+    def __init__(self, station: Station, session: HilSession, parameters: Parameters) -> None:
         self._station = station
-        self._vehicle = vehicle
+        self._who = session.who
+        self._schedule = Schedule(
+            session.encoders, {"HEARTBEAT": None}
+        )  # the station's link has a heartbeat of its own
         self._requests = Requests(
-            VEHICLE, vehicle.offered, {**vehicle.commands, REQUEST_CAPABILITIES: self._say_version}
+            session.who, self._schedule, OFFERED, {**session.commands, REQUEST_CAPABILITIES: self._say_version}
         )
-        self._parameters = ParameterServer(parameters, lambda: vehicle.armed, vehicle.say_parameter)
+        self._parameters = ParameterServer(parameters, session.who, lambda: session.armed, session.say_parameter)
         self._look = Due(POLL_HZ)
         self.next_ns = 0
 
@@ -38,15 +41,16 @@ class GroundStation:
 
     def poll(self, t_ns: int) -> None:
         """Hear the station, at simulation time t_ns, and answer it."""
-        self._station.t_us = max(0, t_ns) // 1000
-        sayings: list[Saying] = []
+        t_ns = max(0, t_ns)
+        self._station.t_us = t_ns // 1000
         for frame in self._station.poll():
             if frame.message_id == FILE_TRANSFER.message_id:
-                refusal = encode_refusal(frame.payload, VEHICLE, (frame.system, frame.component))
-                sayings += [(FILE_TRANSFER, refusal)] if refusal else []
+                refusal = encode_refusal(frame.payload, self._who, (frame.system, frame.component))
+                if refusal:
+                    self._schedule.answer((FILE_TRANSFER, refusal))
             elif not self._requests.take(frame):
                 self._parameters.take(frame)
-        for saying in (*sayings, *self._requests.due(max(0, t_ns), self._vehicle.on_request), *self._parameters.due()):
+        for saying in (*self._schedule.due(t_ns), *self._parameters.due()):
             self._station.say(*saying)
 
     def counters(self) -> dict[str, int]:
@@ -54,5 +58,5 @@ class GroundStation:
         return {**self._requests.counters, **self._station.counters()}
 
     def _say_version(self, _request: Request) -> Result:
-        self._requests.ask_once(mapping.VERSION.message_id)
+        self._schedule.ask_once(VERSION.message_id)
         return Result.ACCEPTED

@@ -5,25 +5,31 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-from bridge.requests import Saying
 from controller.parameters import Parameters
-from protocol.messages import VEHICLE
 from protocol.wire import parameter_mapping
 from protocol.wire.codec import Frame
 from protocol.wire.parameter_mapping import Refusal, Wanted
+from protocol.wire.schedule import Saying
 
 BURST = 16
 """Values of a list that are said at one occasion."""
 
 
 class ParameterServer:
-    """Answers a peer's PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET.
+    """Answers a peer's PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET to `who`, our (system, component).
 
     is_armed: whether sets must be refused. on_change: is told the index of what was set.
     """
 
-    def __init__(self, parameters: Parameters, is_armed: Callable[[], bool], on_change: Callable[[int], None]) -> None:
+    def __init__(
+        self,
+        parameters: Parameters,
+        who: tuple[int, int],
+        is_armed: Callable[[], bool],
+        on_change: Callable[[int], None],
+    ) -> None:
         self._parameters = parameters
+        self._who = who
         self._is_armed = is_armed
         self._on_change = on_change
         self._listing: deque[int] = deque()
@@ -41,7 +47,7 @@ class ParameterServer:
         decode, handler = self._handlers[frame.message_id]
         wanted = decode(frame.payload)
         system, component = wanted.target
-        if system not in (0, VEHICLE[0]) or component not in (0, VEHICLE[1]):
+        if system not in (0, self._who[0]) or component not in (0, self._who[1]):
             return False
         handler(wanted, (frame.system, frame.component))
         return True

@@ -23,7 +23,6 @@ from fwav_hil.latency.echo import TICK_BYTES
 from protocol.errors import PeerMissingError
 from protocol.wire import mapping
 from protocol.wire.codec import FrameReader, FrameWriter
-from protocol.wire.tick_frames import TickWriter
 
 GROUND_STATION = (255, 190)
 EMULATOR = (1, 191)
@@ -106,11 +105,13 @@ def probe_echo(stop: StopFlag, *, rate_hz: float, count: int, told: Told) -> Pro
 def probe_mavutil(stop: StopFlag, *, rate_hz: float, count: int, told: Told) -> ProbeResult:
     """Pose and tick there, HIL_ACTUATOR_CONTROLS back, by a mavutil script at the other end."""
     period_ns = round(1e9 / rate_hz)
-    ticks, reader = TickWriter(FrameWriter(*EMULATOR)), FrameReader(is_datagram=True)
+    writer, reader = FrameWriter(*EMULATOR), FrameReader(is_datagram=True)
     q, readings = np.zeros(6), np.zeros(13)
 
     def question(number: int) -> bytes:
-        return b"".join(ticks.frames((number + 1) * period_ns, q, readings))
+        t_ns = (number + 1) * period_ns
+        pose = writer.seal(mapping.POSE, mapping.encode_pose(t_ns, q))
+        return pose + writer.seal(mapping.TICK, mapping.encode_tick(t_ns, readings))
 
     def answered(data: bytes) -> list[int]:
         found = []

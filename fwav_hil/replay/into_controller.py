@@ -14,40 +14,58 @@ from bridge.process import StopFlag
 from controller.laws.law import make_law
 from controller.laws.registry import refuse_on_a_link
 from controller.parameters import followed
+from controller.sinks.hil import HilSink
+from controller.sources.hil import HilSource
+from controller.tick import Tick
+from fwav_hil.replay import recorded_run
 from fwav_hil.replay.other_end import other_end
-from fwav_hil.replay.recorded_run import Recorded, Tick
+from fwav_hil.replay.recorded_run import Recorded
 from fwav_hil.replay.replay_result import Difference
 from plant_emulator.pacing.lockstep import RESEND_AFTER_S
 from plant_emulator.pacing.meeting import meet_controller
 from plant_emulator.process import FAREWELLS
 from protocol.errors import PeerLostError
-from protocol.messages import VEHICLE, ActuatorCommand
+from protocol.messages import VEHICLE
 from protocol.wire import mapping
+from protocol.wire.codec import Frame, FrameReader, FrameWriter, lone_frame
+from protocol.wire.mapping import is_armed
 
 _LINK = "udpin://127.0.0.1:0"
 
 
+class _RecordedSession:
+    """Armed as the recorded controller was; nothing but commands is said."""
+
+    armed = False
+
+    def hear(self, frame: Frame) -> None:
+        """Leave out what carries no pose."""
+
+    def due_frames(self, _t_ns: int) -> list[bytes]:
+        """Nothing."""
+        return []
+
+
 def replay_in_process(run: Recorded) -> Difference:
-    """Step the law of the run's scenario over its samples, in this process. Raises UsageError for state feedback."""
+    """Let the controller's tick answer the samples, in this process. Raises UsageError for state feedback."""
     refuse_on_a_link(run.scenario)
     law = make_law(run.scenario.law, run.scenario)
-    state, was_armed = law.start(), False
-    answers: dict[int, bytes] = {}
+    session, answers = _RecordedSession(), dict[int, bytes]()
+    writer = FrameWriter(*VEHICLE)
+    source = HilSource(FrameReader(is_datagram=True), (VEHICLE[0], run.scenario.wire.emulator_component))
+
+    def keep(answer: bytes) -> None:
+        answers.setdefault(controller.answered_ns, lone_frame(answer).payload)
+
+    controller = Tick(law, source, HilSink(writer, lockstep=run.lockstep), session, writer, keep)
     scenario = run.scenario
     for tick in run.ticks:
         if (gains := followed(scenario, tick.parameters)) is not scenario:
             scenario = gains  # set while disarmed: the law starts again with them
             law.adopt(make_law(law.name, gains))
-        sample = mapping.decode_pose(tick.pose)
-        if sample is None or sample.t_ns != tick.t_ns or tick.t_ns in answers:
-            continue  # as the controller does: no pose, no sample; a tick sent again is answered as before
         recorded = run.commands.get(tick.t_ns)
-        armed = recorded is None or bool(recorded[mapping.COMMAND_MODE] & mapping.ARMED)
-        if not (armed and was_armed):
-            law.restart(state)
-        was_armed = armed
-        command = ActuatorCommand(sample.t_ns, law.step(state, sample.t_ns, sample.q), armed)
-        answers[tick.t_ns] = mapping.encode_command(command, law.output.scale, lockstep=run.lockstep)
+        session.armed = recorded is None or is_armed(recorded)
+        controller.take(tick.datagram)
     return compare_commands(run, answers)
 
 
@@ -85,7 +103,7 @@ def ask_controller(run: Recorded, link: Link, wait_s: float, stop: StopFlag) -> 
     return answers
 
 
-def _answer(endpoint: Endpoint, tick: Tick) -> bytes:
+def _answer(endpoint: Endpoint, tick: recorded_run.Tick) -> bytes:
     for wait_s in RESEND_AFTER_S:
         endpoint.link.send(tick.datagram)
         while frames := endpoint.receive(wait_s):

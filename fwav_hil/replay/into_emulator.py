@@ -16,7 +16,8 @@ from fwav_hil.children import Child, listen
 from fwav_hil.replay.other_end import other_end
 from fwav_hil.replay.recorded_run import Recorded, Tick
 from fwav_hil.replay.replay_result import Difference
-from plant_emulator.emulator import Emulator
+from plant_emulator.command_source import Found
+from plant_emulator.tick import Emulator
 from protocol.errors import PeerLostError, PeerMissingError
 from protocol.messages import VEHICLE, FloatArray
 from protocol.wire import mapping
@@ -36,23 +37,23 @@ def replay_in_process(run: Recorded) -> Difference:
     with near, far:
         endpoint = Endpoint(near, VEHICLE[0], run.scenario.wire.emulator_component)
         emulator = Emulator(run.scenario, endpoint, None)
-        period_ns, newest_ns = run.scenario.period_ns, -1
+        source, period_ns = emulator.source, run.scenario.period_ns
         sent: dict[int, bytes] = {}
         for number, tick in enumerate(run.ticks):
             t_ns = number * period_ns
             sent[t_ns] = b"".join(emulator.sense(t_ns))
+            source.expect(0, t_ns)
             for stamp_us, frame in tick.answers:
-                if frame.message_id != mapping.COMMAND.message_id:
+                source.feed(frame.raw)
+                if source.read() != Found.COMMAND:
                     continue
-                command = emulator.decode(frame.payload)
-                if command is None or command.t_ns <= newest_ns:
-                    continue
-                newest_ns = command.t_ns
                 if run.lockstep:
-                    emulator.act(t_ns, run.scenario.delay_ns, command)
+                    emulator.act(t_ns, run.scenario.delay_ns)
                 else:
                     since_tick_ns = min(max(0, 1000 * (stamp_us - tick.stamp_us)), period_ns)
-                    emulator.act(t_ns + since_tick_ns, 0, command)
+                    emulator.act(t_ns + since_tick_ns, 0)
+            others, source.others = source.others, []
+            emulator.hear(others)
             if not run.lockstep:
                 emulator.check_staleness(t_ns + period_ns)
             emulator.advance(t_ns + period_ns)

@@ -24,8 +24,10 @@ from fwav_hil.logs.choice import time_of_day
 from fwav_hil.progress import StatusLine
 from fwav_hil.replay.keyboard import HELP, Keyboard
 from protocol.errors import PeerMissingError, UsageError
-from protocol.logs.retime import Signer, TimeMover, read_key
+from protocol.logs.dialect import layouts
+from protocol.logs.retime import TimeMover
 from protocol.logs.scan import Scan
+from protocol.wire.signing import Signatures, read_key
 
 _DRAIN_LIMIT = 100
 _DRAW_PERIOD_NS = 200_000_000
@@ -102,7 +104,7 @@ class Replay:
         self._clock = clock
         self._stop = stop
         self._mover = TimeMover(scan, chosen, unix_time_us()) if options.rewrite_time else None
-        self._signer = Signer(key) if key else None
+        self._signer = Signatures(key, messages=layouts()) if key else None
         self._not_signed = 0
         self._told_of_refusal = False
         self._were_signed = int(np.count_nonzero(scan.frames["signed"][chosen]))

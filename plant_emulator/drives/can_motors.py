@@ -26,6 +26,7 @@ from bridge.process import StopFlag
 from bridge.reporting import Report
 from bridge.timing.clock import Clock
 from protocol.can_frame import CanFrame
+from protocol.due import Due
 from protocol.errors import (
     FwavHilError,
     LinkInUseError,
@@ -40,7 +41,6 @@ from protocol.motors.can_stuffing import exact_bits
 from protocol.motors.motor_protocol import CAUSES, DRIVES, Cause, Status, make_host
 from protocol.motors.simulation_sync import ALL_AXES, TICKS
 from protocol.scenario import NANOSECONDS, Scenario
-from protocol.wire.streams import Due
 
 ENABLE_AGAIN_NS = NANOSECONDS // 10
 """Of simulation time, between two tries to enable drives that are not."""

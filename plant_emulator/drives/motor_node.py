@@ -20,10 +20,10 @@ import numpy as np
 
 from plant_emulator.drives.motor import DriveBank
 from protocol.can_frame import CanFrame
+from protocol.due import Due
 from protocol.motors import simulation_sync
 from protocol.motors.motor_protocol import CAUSES, DRIVES, Action, Cause, Drive, Fault, Order, Reading, make_drive
 from protocol.scenario import NANOSECONDS, Scenario
-from protocol.wire.streams import Due
 
 HOST_GONE_NS = 2 * NANOSECONDS
 OWN_STEP_NS = NANOSECONDS // 1000

@@ -5,18 +5,18 @@ from __future__ import annotations
 from bridge.endpoint import Endpoint, refuse_other_scenario
 from bridge.process import StopFlag
 from bridge.timing.clock import MonotonicClock
-from plant_emulator.on_request import OnRequest
+from plant_emulator.tick import Emulator
+from protocol.due import Due
 from protocol.errors import PeerMissingError
 from protocol.messages import VEHICLE
 from protocol.scenario import NANOSECONDS, Scenario
 from protocol.wire import mapping
-from protocol.wire.streams import Due
 
 HELLO_PERIOD_S = 0.1
 
 
 def meet_controller(
-    scenario: Scenario, wait_s: float, endpoint: Endpoint, stop: StopFlag, on_request: OnRequest | None = None
+    scenario: Scenario, wait_s: float, endpoint: Endpoint, stop: StopFlag, emulator: Emulator | None = None
 ) -> None:
     """Hold the plant at t = 0 until a controller with the same scenario says it is armed. Raises PeerError, Interrupted."""
     digest = scenario.digest()
@@ -33,11 +33,10 @@ def meet_controller(
         if heard and due.at(now_ns):
             endpoint.send(hello)
         received = endpoint.receive(HELLO_PERIOD_S)
-        if on_request:
-            for frame in received:
-                on_request.take(frame)
-            if replies := on_request.replies():
-                endpoint.send(endpoint.seal(*reply) for reply in replies)
+        if emulator:
+            emulator.hear(received)
+            if answers := emulator.answers():
+                endpoint.send(endpoint.seal(*answer) for answer in answers)
         for frame in received:
             if (frame.system, frame.component) != VEHICLE:
                 continue
@@ -65,7 +64,7 @@ def meet_controller(
     )
 
 
-def meet_autopilot(wait_s: float, endpoint: Endpoint, stop: StopFlag, on_request: OnRequest) -> None:
+def meet_autopilot(wait_s: float, endpoint: Endpoint, stop: StopFlag, emulator: Emulator) -> None:
     """Say hello until an autopilot (1/1) says anything. Raises PeerMissingError, Interrupted.
 
     PX4 over TCP speaks when it is accepted; over UDP it waits to be spoken to.
@@ -78,8 +77,7 @@ def meet_autopilot(wait_s: float, endpoint: Endpoint, stop: StopFlag, on_request
         if due.at(now_ns):
             endpoint.send([endpoint.seal(mapping.HEARTBEAT, mapping.encode_emulator_heartbeat())])
         received = endpoint.receive(HELLO_PERIOD_S)
-        for frame in received:
-            on_request.take(frame)  # answered with the first tick
+        emulator.hear(received)  # requests are answered with the first tick
         if any((frame.system, frame.component) == VEHICLE for frame in received):
             endpoint.writer.sequence = 0
             return

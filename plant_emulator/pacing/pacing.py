@@ -1,4 +1,4 @@
-"""What every way of keeping time between the emulator and its peer does: one tick across the link, and its books."""
+"""What every way of keeping time between the emulator and its peer does: carry one tick across the link, keep its books."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ from bridge.endpoint import Endpoint
 from bridge.process import StopFlag
 from bridge.timing.clock import Clock
 from bridge.timing.rate import RateKeeper
-from plant_emulator.emulator import Emulator
+from plant_emulator.command_source import Found
+from plant_emulator.tick import Emulator
 from protocol.logs.tlog import TlogWriter
+from protocol.wire.codec import Frame
 
 
 class Parts(NamedTuple):
-    """What a pacing brings together, whichever it is; period_ns: from tick to tick."""
+    """What a pacing brings together, whichever it is; period_ns: from tick to tick, ticks: how many there are."""
 
     emulator: Emulator
     endpoint: Endpoint
@@ -23,6 +25,7 @@ class Parts(NamedTuple):
     clock: Clock
     stop: StopFlag
     period_ns: int
+    ticks: int
 
 
 class Pacing(abc.ABC):
@@ -34,27 +37,101 @@ class Pacing(abc.ABC):
     """
 
     def __init__(self, parts: Parts) -> None:
-        self.emulator, self.endpoint, self.log, self.clock, self.stop, self.period_ns = parts
+        self.emulator, self.endpoint, self.log, self.clock, self.stop, self.period_ns, ticks = parts
+        self.end_ns = ticks * self.period_ns
         self.keeper: RateKeeper | None = None
         self.latencies_ns: list[int] = []
         self.counters: dict[str, int] = {}
         self._owed: list[tuple[int, Sequence[bytes]]] = []
+        self.sent_ns = 0
+        """When the tick sent last was handed to the link, on the clock."""
+        self.datagram = b""
+        """That tick, as it was sent."""
+        self._is_sent = False
 
-    @abc.abstractmethod
-    def exchange(self, tick: int, t_ns: int) -> None:
-        """Send the tick at simulation time t_ns, hand what comes of it to the emulator, and move that to the next tick.
+    def exchange(self, t_ns: int) -> None:
+        """Send the tick at simulation time t_ns, let what comes of it act, and move the plant on to the next tick.
 
         Raises PeerLostError where the controller fell silent, Interrupted where the user asked to stop, DivergenceError
         where the plant cannot go on; the tick's row is then recorded.
         """
+        self.stop.check()
+        if not self._is_sent:
+            self.begin(t_ns)
+            self.send(t_ns)
+        self._is_sent = False
+        self.settle_books(t_ns)
+        self.take_commands(t_ns)
+        self.move(t_ns)
+        following_ns = t_ns + self.period_ns
+        if self.sends_ahead and following_ns < self.end_ns:
+            self.send(following_ns)
+            self._is_sent = True
+        self.emulator.record(t_ns)  # like all books, kept while the next tick is on its way
+
+    sends_ahead = True
+    """Whether a tick leaves as soon as the plant has reached it, before the books of the one before it are kept."""
+
+    def begin(self, t_ns: int) -> None:  # noqa: B027  (most have nothing to wait for)
+        """Wait until the tick at t_ns is to be sent."""
+
+    @abc.abstractmethod
+    def take_commands(self, t_ns: int) -> None:
+        """Receive what comes upon the tick at t_ns, and let its commands act."""
+
+    @abc.abstractmethod
+    def stamp_us(self, t_ns: int) -> int:
+        """The time (us) under which what belongs to the tick at t_ns, now sent, is logged."""
+
+    @abc.abstractmethod
+    def command_came(self, t_ns: int) -> None:
+        """React to the newest command, read during the tick at t_ns: let it act."""
+
+    def send(self, t_ns: int) -> None:
+        """Measure the plant at t_ns and send the tick."""
+        frames = self.emulator.sense(t_ns)
+        self.datagram = frames[0] + frames[1] if len(frames) == 2 else b"".join(frames)
+        self.sent_ns = self.clock.now_ns()
+        self.endpoint.link.send(self.datagram)
+        self.owe_log(self.stamp_us(t_ns), frames)
+
+    def take(self, data: bytes, t_ns: int) -> None:
+        """Take all that came during the tick at t_ns, in its order: commands act, the rest is heard."""
+        source = self.emulator.source
+        source.feed(data)
+        while True:
+            found = source.read()
+            self.note_received()
+            if source.others:
+                others, source.others = source.others, []
+                self.hear(others)
+            if found == Found.COMMAND:
+                self.command_came(t_ns)
+            elif found == Found.NOTHING:
+                return
+
+    def note_received(self) -> None:  # noqa: B027  (lockstep logs an answer when it is whole)
+        """Log the frames that were just read."""
+
+    def hear(self, frames: list[Frame]) -> None:
+        """React to frames that are no commands."""
+        self.emulator.hear(frames)
+
+    def move(self, t_ns: int) -> None:
+        """Note the row of the tick at t_ns and move the plant on."""
+        self.emulator.advance(t_ns + self.period_ns)
 
     def all_counters(self) -> dict[str, int]:
         """Everything counted, by name, that of the schedule too."""
         return {**self.counters, **(self.keeper.counters if self.keeper else {})}
 
     def owe_log(self, t_us: int, frames: Sequence[bytes]) -> None:
-        """Have frames logged under one time, at the next `settle_log`."""
+        """Have frames logged under one time, when the books are next settled."""
         self._owed.append((t_us, frames))
+
+    def settle_books(self, _t_ns: int) -> None:
+        """See to what can wait until the tick is on its way."""
+        self.settle_log()
 
     def settle_log(self) -> None:
         """Write what is owed to the log: done while the other end is at work, and at the end of the run."""

@@ -7,7 +7,7 @@ step of the integrator splits that step in two, so the moment of its action is e
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -29,13 +29,18 @@ PITCH_LIMIT = 2
 TOO_MANY_PENDING = 3
 
 
-class GearParameters(NamedTuple):
-    """The gears: model code, slope h (6,), kappa or half width (6,), chi (6,); see `backlash`."""
+class ActuatorParameters(NamedTuple):
+    """From commands to the wrench on the body: u = gear(tau), then wrench = allocation u.
+
+    model, h, p, chi   the gears: model code, slope (6,), kappa or half width (6,), chi (6,); see `backlash`
+    allocation (6, 6)  generalised body force (row) that one unit of each actuator's u (column) makes; identity: six forces
+    """
 
     model: int
     h: FloatArray
     p: FloatArray
     chi: FloatArray
+    allocation: FloatArray
 
 
 class PlantState(NamedTuple):
@@ -43,7 +48,8 @@ class PlantState(NamedTuple):
 
     motion        (12,)       q and q' (m, rad, m/s, rad/s)
     tau           (6,)        motor command in action (N, N m)
-    u             (6,)        generalised body force after the gears
+    u             (6,)        what leaves the actuators, after the gears
+    wrench        (6,)        generalised body force that u makes: allocation u
     d             (6,)        hysteresis state u - h tau
     pending_ns    (PENDING,)  when each command on its way begins to act
     pending_tau   (PENDING, 6)
@@ -54,6 +60,7 @@ class PlantState(NamedTuple):
     motion: FloatArray
     tau: FloatArray
     u: FloatArray
+    wrench: FloatArray
     d: FloatArray
     pending_ns: npt.NDArray[np.int64]
     pending_tau: FloatArray
@@ -64,11 +71,13 @@ class PlantState(NamedTuple):
 def initial_state(scenario: Scenario) -> PlantState:
     """The plant at t = 0: the scenario's motion, its initial command in action, d = 0."""
     tau = np.array(scenario.initial.command)
+    u = np.array(scenario.hysteresis.h) * tau
     packed = pack(
         {
             "motion": scenario.initial_motion,
             "tau": tau,
-            "u": np.array(scenario.hysteresis.h) * tau,
+            "u": u,
+            "wrench": u,
             "d": np.zeros(6),
             "pending_ns": np.zeros(PENDING, dtype=np.int64),
             "pending_tau": np.zeros((PENDING, 6)),
@@ -92,8 +101,20 @@ def push_command(state: PlantState, t_ns: int, tau: FloatArray) -> bool:
 
 
 @compiled
-def apply_due_commands(state: PlantState, gears: GearParameters, t_ns: int) -> None:
+def allocate(allocation: FloatArray, u: FloatArray, wrench: FloatArray) -> None:
+    """Fill wrench (6,) with allocation (6, 6) times u (6,)."""
+    for i in range(6):
+        total = 0.0
+        for j in range(6):
+            total += allocation[i, j] * u[j]
+        wrench[i] = total
+
+
+@compiled
+def apply_due_commands(state: PlantState, gears: ActuatorParameters, t_ns: int) -> None:
     """Move the motors by every command whose time has come, one after the other: the gears see each reversal."""
+    if state.queue[1] == 0 or state.pending_ns[state.queue[0]] > t_ns:
+        return
     while state.queue[1] > 0 and state.pending_ns[state.queue[0]] <= t_ns:
         at = state.queue[0]
         for i in range(6):
@@ -104,28 +125,37 @@ def apply_due_commands(state: PlantState, gears: GearParameters, t_ns: int) -> N
             state.tau[i] = tau
         state.queue[0] = (at + 1) % PENDING
         state.queue[1] -= 1
+    allocate(gears.allocation, state.u, state.wrench)
 
 
 @compiled
-def _specific_wrench(t: float, u: FloatArray, body: BodyParameters) -> Specific:
-    """The wrench that acts on the body at time t (s), gears plus disturbance, over its inertia."""
+def specific_wrench(t: float, wrench: FloatArray, body: BodyParameters) -> Specific:
+    """What acts on the body at time t (s), actuators plus disturbance, over its inertia."""
     s, d = body.specific, body.disturbance
     swing = 0.0
     if body.disturbance_frequency != 0.0:
         swing = math.sin(body.disturbance_frequency * t)
     return (
-        s[0] * u[0] + swing * d[0],
-        s[1] * u[1] + swing * d[1],
-        s[2] * u[2] + swing * d[2],
-        s[3] * u[3] + swing * d[3],
-        s[4] * u[4] + swing * d[4],
-        s[5] * u[5] + swing * d[5],
+        s[0] * wrench[0] + swing * d[0],
+        s[1] * wrench[1] + swing * d[1],
+        s[2] * wrench[2] + swing * d[2],
+        s[3] * wrench[3] + swing * d[3],
+        s[4] * wrench[4] + swing * d[4],
+        s[5] * wrench[5] + swing * d[5],
     )
 
 
 @compiled
-def runge_kutta_step(motion: FloatArray, u: FloatArray, t: float, step: float, body: BodyParameters) -> None:
-    """One classical Runge-Kutta step of fourth order on motion (12,), in place; u (6,) is constant over it.
+def specific_force(t: float, wrench: FloatArray, body: BodyParameters, force: FloatArray) -> None:
+    """Fill force (3,), m/s^2, with what an accelerometer reads at time t (s): a - g in the body frame."""
+    swing = math.sin(body.disturbance_frequency * t) if body.disturbance_frequency != 0.0 else 0.0
+    for i in range(3):
+        force[i] = wrench[i] / body.mass + swing * body.disturbance[i]
+
+
+@compiled
+def runge_kutta_step(motion: FloatArray, wrench: FloatArray, t: float, step: float, body: BodyParameters) -> None:
+    """One classical Runge-Kutta step of fourth order on motion (12,), in place; the wrench (6,) is constant over it.
 
     Written out in scalars, since that lets the compiler keep all of it in registers. Accelerations do not depend on
     position and velocity, so the stages of the translation fold into one sum each.
@@ -133,10 +163,10 @@ def runge_kutta_step(motion: FloatArray, u: FloatArray, t: float, step: float, b
     half, sixth = 0.5 * step, step / 6.0
     a, b, c = motion[3], motion[4], motion[5]
     va, vb, vc = motion[9], motion[10], motion[11]
-    start = _specific_wrench(t, u, body)
+    start = specific_wrench(t, wrench, body)
     middle = end = start
     if body.disturbance_frequency != 0.0:
-        middle, end = _specific_wrench(t + half, u, body), _specific_wrench(t + step, u, body)
+        middle, end = specific_wrench(t + half, wrench, body), specific_wrench(t + step, wrench, body)
 
     x1, y1, z1, a1, b1, c1 = acceleration(a, b, c, va, vb, vc, start, body)
     va2, vb2, vc2 = va + half * a1, vb + half * b1, vc + half * c1
@@ -162,7 +192,7 @@ def runge_kutta_step(motion: FloatArray, u: FloatArray, t: float, step: float, b
 
 @compiled
 def advance(
-    state: PlantState, body: BodyParameters, gears: GearParameters, t_ns: int, end_ns: int, substep_ns: int
+    state: PlantState, body: BodyParameters, gears: ActuatorParameters, t_ns: int, end_ns: int, substep_ns: int
 ) -> int:
     """Integrate from t_ns to end_ns, a whole number of substeps later. Returns GOES_ON, NOT_FINITE or PITCH_LIMIT."""
     substep_end = t_ns + substep_ns
@@ -171,7 +201,7 @@ def advance(
         until = substep_end
         if state.queue[1] > 0 and state.pending_ns[state.queue[0]] < until:
             until = state.pending_ns[state.queue[0]]
-        runge_kutta_step(state.motion, state.u, t_ns * 1e-9, (until - t_ns) * 1e-9, body)
+        runge_kutta_step(state.motion, state.wrench, t_ns * 1e-9, (until - t_ns) * 1e-9, body)
         t_ns = until
         if t_ns == substep_end:
             substep_end += substep_ns
@@ -216,14 +246,25 @@ def _advance_packed(state: Packed, parameters: Packed, t_ns: int, end_ns: int) -
 
 
 @compiled
+def record_and_advance(
+    state: PlantState, parameters: Any, t_ns: int, end_ns: int, command: FloatArray, row: FloatArray
+) -> int:
+    """Let what is due act at t_ns, fill the row (31,) of that moment, then `advance`; returns its outcome."""
+    apply_due_commands(state, parameters, t_ns)
+    fill_row(state, command, row)
+    return advance(state, parameters, parameters, t_ns, end_ns, parameters.substep_ns)
+
+
+@compiled
 def _record_and_advance_packed(
     state: Packed, parameters: Packed, t_ns: int, end_ns: int, command: FloatArray, row: FloatArray
 ) -> int:
-    """What acts at t_ns, the row of that moment, then `advance`; on packed structures."""
-    data = parameters[0]
-    apply_due_commands(state[0], data, t_ns)
-    fill_row(state[0], command, row)
-    return advance(state[0], data, data, t_ns, end_ns, data.substep_ns)
+    return record_and_advance(state[0], parameters[0], t_ns, end_ns, command, row)
+
+
+@compiled
+def _specific_force_packed(state: Packed, parameters: Packed, t: float, force: FloatArray) -> None:
+    specific_force(t, state[0].wrench, parameters[0], force)
 
 
 class Plant:
@@ -237,7 +278,7 @@ class Plant:
     def __init__(self, scenario: Scenario, *, gears_elsewhere: bool = False) -> None:
         self.state = initial_state(scenario)
         self.body = body_parameters(scenario.body, scenario.disturbance)
-        self.gears = GearParameters(*gear_parameters(scenario.hysteresis))
+        self.gears = ActuatorParameters(*gear_parameters(scenario.hysteresis), np.eye(6))
         if gears_elsewhere:
             self.gears = self.gears._replace(model=ELSEWHERE)
             self.state.tau[:] = self.state.u
@@ -248,7 +289,11 @@ class Plant:
     def command(self, t_ns: int, tau: FloatArray) -> None:
         """Let tau (6,) act from t_ns on; times must not decrease. Raises DivergenceError where too many are on their way."""
         if not _push_packed(self.state.packed, t_ns, tau):
-            raise DivergenceError(divergence_sentence(TOO_MANY_PENDING, self.t_ns))
+            self.refuse_more()
+
+    def refuse_more(self) -> None:
+        """Raise DivergenceError since too many commands are on their way."""
+        raise DivergenceError(divergence_sentence(TOO_MANY_PENDING, self.t_ns))
 
     def apply_due_commands(self) -> None:
         """Let the commands act whose time is now, without moving on."""
@@ -262,6 +307,12 @@ class Plant:
         """Let the commands act whose time is now, fill the row (31,) of this moment (see `fill_row`), then `advance`."""
         outcome = _record_and_advance_packed(self.state.packed, self.parameters, self.t_ns, end_ns, command, row)
         self.arrive(end_ns, outcome)
+
+    def specific_force(self) -> FloatArray:
+        """What an accelerometer reads now (3,), m/s^2: a - g in the body frame."""
+        force = np.empty(3)
+        _specific_force_packed(self.state.packed, self.parameters, self.t_ns * 1e-9, force)
+        return force
 
     def arrive(self, end_ns: int, outcome: int) -> None:
         """Take note that a kernel has moved the state to end_ns. Raises DivergenceError where its outcome says so."""

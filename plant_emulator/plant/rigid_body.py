@@ -24,12 +24,14 @@ Specific: TypeAlias = tuple[float, float, float, float, float, float]
 class BodyParameters(NamedTuple):
     """What the equations of motion need, prepared for the kernels.
 
+    mass                kg
     specific (6,)       1/m three times, then 1/Ixx, 1/Iyy, 1/Izz: a wrench times this is specific
     gyration (3,)       (Izz - Iyy)/Ixx, (Ixx - Izz)/Iyy, (Iyy - Ixx)/Izz
     gravity             m/s^2
     disturbance (6,)    specific amplitude of a wrench after the gears, times sin(disturbance_frequency t)
     """
 
+    mass: float
     specific: FloatArray
     gyration: FloatArray
     gravity: float
@@ -42,6 +44,7 @@ def body_parameters(body: Body, disturbance: Disturbance) -> BodyParameters:
     ixx, iyy, izz = body.inertia
     specific = 1.0 / np.array((body.mass,) * 3 + body.inertia)
     return BodyParameters(
+        body.mass,
         specific,
         np.array(((izz - iyy) / ixx, (ixx - izz) / iyy, (iyy - ixx) / izz)),
         body.gravity,

@@ -6,14 +6,20 @@ motors to zero, and a command that has grown stale turns each channel to its saf
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from protocol.compiled import compiled
-from protocol.messages import ActuatorCommand, FloatArray
+from protocol.compiled import Packed, compiled, pack
+from protocol.messages import FloatArray
 from protocol.scenario import NANOSECONDS, Actuators
 
 _TOLERANCE = 1e-6
 """Part of a channel's range that float32 may add to a limit without the clamp being counted."""
+
+CAUSES = ("clamped", "disarmed", "stale")
+CLAMPED, DISARMED, STALE = range(len(CAUSES))
+_OUTAGE = -1  # in place of the last command's time: the safe output has been given
 
 
 @compiled
@@ -26,48 +32,72 @@ def clamp(tau: FloatArray, lower: FloatArray, upper: FloatArray, allowed: FloatA
     return excess
 
 
+@compiled
+def pass_command(envelope: Any, t_ns: int, tau: FloatArray, armed: bool) -> None:
+    """Fill envelope.allowed (6,) with what the motors get of a command that came at simulation time t_ns."""
+    envelope.last_ns = t_ns
+    if not armed:
+        envelope.counters[DISARMED] += 1
+        envelope.allowed[:] = 0.0
+    elif clamp(tau, envelope.lower, envelope.upper, envelope.allowed) > _TOLERANCE:
+        envelope.counters[CLAMPED] += 1
+
+
+@compiled
+def expired_ns(envelope: Any, t_ns: int) -> int:
+    """When the last command grew stale, once per outage; -1 where it is not too old at t_ns, or that was said before."""
+    if envelope.last_ns == _OUTAGE or t_ns - envelope.last_ns <= envelope.staleness_ns:
+        return -1
+    since_ns = envelope.last_ns + envelope.staleness_ns
+    envelope.last_ns = _OUTAGE
+    envelope.counters[STALE] += 1
+    return int(since_ns)
+
+
+@compiled
+def _pass_packed(envelope: Packed, t_ns: int, tau: FloatArray, armed: bool) -> None:
+    pass_command(envelope[0], t_ns, tau, armed)
+
+
+@compiled
+def _expired_packed(envelope: Packed, t_ns: int) -> int:
+    return expired_ns(envelope[0], t_ns)
+
+
 class SafetyEnvelope:
     """Limits, arming and staleness.
 
-    lower, upper   (6,) the limits
+    packed     the envelope as the kernels take it
     counters   clamped   commands that were beyond a limit
                disarmed  commands that came without arming
                stale     times the output went to its safe value because no command came within staleness_s
     """
 
     def __init__(self, actuators: Actuators) -> None:
-        self.lower = np.array(actuators.lower)
-        self.upper = np.array(actuators.upper)
         self._safe = np.array(actuators.safe)
-        self._staleness_ns = round(actuators.staleness_s * NANOSECONDS)
-        self._last_ns: int | None = 0  # from t = 0 on a first command is awaited, like any other
-        self.counters = {"clamped": 0, "disarmed": 0, "stale": 0}
+        self.packed = pack(
+            {
+                "lower": np.array(actuators.lower),
+                "upper": np.array(actuators.upper),
+                "allowed": np.zeros(6),
+                "staleness_ns": round(actuators.staleness_s * NANOSECONDS),
+                "last_ns": 0,  # from t = 0 on a first command is awaited, like any other
+                "counters": np.zeros(len(CAUSES), dtype=np.int64),
+            }
+        )
+        self.allowed: FloatArray = self.packed["allowed"][0]
 
-    def accept(self, t_ns: int, command: ActuatorCommand) -> FloatArray:
-        """What the motors get of a command that came at simulation time t_ns: tau (6,)."""
-        if not command.armed:
-            self._last_ns = t_ns
-            self.counters["disarmed"] += 1
-            return np.zeros(6)
-        allowed = np.empty(6)
-        self.accepted(t_ns, clamp(command.tau, self.lower, self.upper, allowed))
-        return allowed
+    @property
+    def counters(self) -> dict[str, int]:
+        """What was counted so far."""
+        return dict(zip(CAUSES, self.packed["counters"][0].tolist(), strict=True))
 
-    def accepted(self, t_ns: int, excess: float) -> None:
-        """Take note of an armed command of that time and excess over the limits, clamped by `clamp`."""
-        self._last_ns = t_ns
-        if excess > _TOLERANCE:
-            self.counters["clamped"] += 1
-
-    def outlasts(self, period_ns: int) -> bool:
-        """Whether no command grows stale within a period after it came."""
-        return self._staleness_ns >= period_ns
+    def pass_command(self, t_ns: int, tau: FloatArray, *, armed: bool) -> FloatArray:
+        """What the motors get of a command tau (6,) that came at simulation time t_ns."""
+        _pass_packed(self.packed, t_ns, tau, armed)
+        return self.allowed.copy()
 
     def stale_output(self, t_ns: int) -> tuple[int, FloatArray] | None:
         """(time it begins to act, safe tau) once per outage, where the last command is too old at t_ns; else None."""
-        if self._last_ns is None or t_ns - self._last_ns <= self._staleness_ns:
-            return None
-        expired_ns = self._last_ns + self._staleness_ns
-        self._last_ns = None
-        self.counters["stale"] += 1
-        return expired_ns, self._safe.copy()
+        since_ns = _expired_packed(self.packed, t_ns)
+        return None if since_ns < 0 else (since_ns, self._safe.copy())

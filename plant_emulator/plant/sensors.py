@@ -13,11 +13,12 @@ import numpy as np
 
 from plant_emulator.plant.rigid_body import body_rates
 from protocol.compiled import compiled
-from protocol.messages import FloatArray, PositionSample
+from protocol.messages import FloatArray
 from protocol.rotations import rotate_to_body
-from protocol.scenario import Noise, World
+from protocol.scenario import World
 
-_BLOCK = 1024
+NOISE_BLOCK = 1024
+"""Ticks whose noise is drawn at once."""
 EARTH_RADIUS = 6_371_000.0
 
 
@@ -37,38 +38,21 @@ def add_noise(q: FloatArray, normal: FloatArray, position: float, attitude: floa
 class PositionSensor:
     """Position and attitude with Gaussian noise per sample, on the position (m) and on the angles (rad)."""
 
-    def __init__(self, noise: Noise, seed: int) -> None:
-        self._noise = noise
+    def __init__(self, seed: int) -> None:
         self._generator = sensor_generator(seed, "position")
-        self._block = np.empty((0, 6))
-        self._at = 0
 
     def draw(self, count: int) -> FloatArray:
         """The standard normal numbers (count, 6) of the next `count` ticks."""
         return self._generator.standard_normal((count, 6))
 
-    def next_normal(self) -> FloatArray:
-        """The standard normal numbers (6,) of the next tick; ask once for every tick."""
-        if self._at == len(self._block):
-            self._block = self.draw(_BLOCK)
-            self._at = 0
-        self._at += 1
-        return np.asarray(self._block[self._at - 1])
-
-    def measure(self, t_ns: int, motion: FloatArray) -> PositionSample:
-        """The sample of the next tick."""
-        q = np.empty(6)
-        add_noise(motion, self.next_normal(), self._noise.position, self._noise.attitude, q)
-        return PositionSample(t_ns, q)
-
 
 @compiled
 def inertial_readings(
-    motion: FloatArray, u: FloatArray, mass: float, field: FloatArray, altitude: float, readings: FloatArray
+    motion: FloatArray, force: FloatArray, field: FloatArray, altitude: float, readings: FloatArray
 ) -> None:
-    """Fill readings (13,) but the last; altitude is that of the origin."""
+    """Fill readings (13,) but the last; force (3,) is the specific force (m/s^2), altitude that of the origin."""
     for i in range(3):
-        readings[i] = u[i] / mass
+        readings[i] = force[i]
     readings[3], readings[4], readings[5] = body_rates(motion)
     readings[6], readings[7], readings[8] = rotate_to_body(
         motion[3], motion[4], motion[5], field[0], field[1], field[2]
@@ -83,20 +67,19 @@ def inertial_readings(
 class InertialSensors:
     """The rest of HIL_SENSOR, without noise: true specific force, body rates, magnetic field, static pressure.
 
-    Specific force is (a - g) in the body frame, which is the wrench of the gears over the mass (a scenario's disturbance
-    force is left out of it). Pressure is the standard atmosphere's.
+    Specific force is (a - g) in the body frame: the force of the whole wrench over the mass. Pressure is the standard
+    atmosphere's.
     """
 
-    def __init__(self, mass: float, world: World) -> None:
-        self._mass = mass
+    def __init__(self, world: World) -> None:
         self._world = world
         self._field = np.array(world.magnetic_field_ned)
         self._readings = np.empty(13)
         self._readings[12] = world.temperature_celsius
 
-    def measure(self, motion: FloatArray, u: FloatArray) -> FloatArray:
-        """The readings (13,) that `mapping.encode_tick` takes; the next call overwrites them."""
-        inertial_readings(motion, u, self._mass, self._field, self._world.altitude, self._readings)
+    def measure(self, motion: FloatArray, force: FloatArray) -> FloatArray:
+        """The readings (13,) that `mapping.encode_tick` takes, of a specific force (3,); the next call overwrites them."""
+        inertial_readings(motion, force, self._field, self._world.altitude, self._readings)
         return self._readings
 
     def geodetic(self, motion: FloatArray) -> tuple[float, float, float]:

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 from protocol.compiled import compiled
-from protocol.logs.records import (
-    Bytes,
-    Table,
-    checksum_verdict,
-    frame_end,
-    message_of,
-    near,
-    signature_size,
-    stamp_at,
-)
+from protocol.logs.records import checksum_verdict, near, stamp_at
+from protocol.wire.framing import Bytes, Table, frame_end, message_of, signature_size
 
 
 @compiled
 def record_follows(data: Bytes, end: int, stamp: int, stamp_size: int) -> bool:
     """Whether the bytes at `end` look like the next record of a log that was at time `stamp`, or are the log's end."""
-    count = data.shape[0]
+    count = len(data)
     if end + stamp_size >= count:
         return True
     if data[end + stamp_size] != 0xFD and data[end + stamp_size] != 0xFE:
@@ -29,8 +21,8 @@ def record_follows(data: Bytes, end: int, stamp: int, stamp_size: int) -> bool:
 @compiled
 def may_begin(data: Bytes, at: int, table: Table, stamp_size: int) -> bool:
     """Whether a checksum at `at` is worth its time: a frame's first byte, and a message or a stamp that is one."""
-    if (data[at] != 0xFD and data[at] != 0xFE) or at + 12 > data.shape[0]:
-        return bool(data[at] == 0xFE) and at + 8 <= data.shape[0]
+    if (data[at] != 0xFD and data[at] != 0xFE) or at + 12 > len(data):
+        return bool(data[at] == 0xFE) and at + 8 <= len(data)
     return bool(table[message_of(data, at)] != 0) or stamp_size == 0 or near(stamp_at(data, at - 8), -1)
 
 
@@ -42,7 +34,7 @@ def unknown_fits(data: Bytes, at: int, table: Table, last: int, stamp_size: int)
         stamp = stamp_at(data, at - 8)
         if not near(stamp, -1) or not record_follows(data, end, stamp, stamp_size):
             return False
-        if not near(stamp, last) and end + stamp_size >= data.shape[0]:
+        if not near(stamp, last) and end + stamp_size >= len(data):
             return False
     elif not record_follows(data, end, -1, 0):
         return False

@@ -1,4 +1,4 @@
-"""Frames changed on their way: their time fields moved, signed anew. Checksums are made to fit.
+"""Frames changed on their way: their time fields moved, their checksums made to fit.
 
 What changes: time_usec, time_boot_ms, time_boot_us and time_unix_usec of the dialect's messages. Times since 1970 then begin
 at the present; times since boot begin at zero for each system, as if it had booted now. Zero means unknown, and stays.
@@ -6,27 +6,21 @@ at the present; times since boot begin at zero for each system, as if it had boo
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
 from types import MappingProxyType
 
-import fastcrc
 import numpy as np
 import numpy.typing as npt
-from pymavlink.dialects.v20 import common
 
-from protocol.errors import UsageError
 from protocol.logs.dialect import layouts
 from protocol.logs.scan import Scan
 from protocol.logs.tables import tables
-from protocol.wire.codec import CRC_SIZE, HEADER_V1, HEADER_V2, MAGIC_V1, SIGNED, Layout
+from protocol.wire.codec import Layout
+from protocol.wire.framing import CRC_SIZE, HEADER_V1, HEADER_V2, MAGIC_V1, SIGNED, checksum, message_of
 
 TIME_FIELDS = MappingProxyType({"time_usec": 1, "time_boot_us": 1, "time_unix_usec": 1, "time_boot_ms": 1000})
 """Names of the fields that are moved, and their unit in us."""
 UNIX_FROM_US = 10**15
 """A time from here on is one since 1970 (this is September 2001); any other is one since boot (this is 31 years)."""
-
-_crc = fastcrc.crc16.mcrf4xx
 
 
 def time_fields(message: Layout) -> tuple[tuple[int, int, int], ...]:
@@ -69,7 +63,8 @@ class TimeMover:
 
     def move(self, frame: bytes, extra_us: int) -> bytes:
         """The frame with its times moved, and by extra_us more; a signature, which no longer fits, is left out."""
-        number, system, header = _identity(frame)
+        number = message_of(frame, 0)
+        system, header = (frame[3], HEADER_V1) if frame[0] == MAGIC_V1 else (frame[5], HEADER_V2)
         fields = self._fields.get(number, ())
         if not fields:
             return frame
@@ -88,13 +83,6 @@ class TimeMover:
         return _sealed(frame, header, payload, message)
 
 
-def _identity(frame: bytes) -> tuple[int, int, int]:
-    """(message id, system, size of the header) of a frame of either version."""
-    if frame[0] == MAGIC_V1:
-        return frame[5], frame[3], HEADER_V1
-    return int.from_bytes(frame[7:10], "little"), frame[5], HEADER_V2
-
-
 def _sealed(frame: bytes, header: int, payload: bytearray, message: Layout) -> bytes:
     """The frame with another payload; MAVLink 1 keeps its length, MAVLink 2 has trailing zeros cut off, and no signature."""
     if header == HEADER_V1:
@@ -102,50 +90,5 @@ def _sealed(frame: bytes, header: int, payload: bytearray, message: Layout) -> b
     else:
         content = bytes(payload).rstrip(b"\0") or b"\0"
         body = bytes((len(content), frame[2] & ~SIGNED)) + frame[3:header] + content
-    return frame[:1] + body + _crc(bytes(body) + message.crc_seed).to_bytes(CRC_SIZE, "little")
-
-
-def read_key(path: Path) -> bytes:
-    """The signing key in a file: 64 hexadecimal digits, or the 32 bytes themselves. Raises UsageError."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise UsageError(f"cannot read the signing key {path}: {error.strerror}") from None
-    if re.fullmatch(rb"\s*[0-9a-fA-F]{64}\s*", data):
-        return bytes.fromhex(data.decode())
-    if len(data) == 32:
-        return data
-    raise UsageError(f"{path} holds no signing key: it must be 64 hexadecimal digits, or 32 bytes")
-
-
-_EPOCH_2015_US = 1_420_070_400_000_000
-
-
-class Signer:
-    """Signs MAVLink 2 frames with a key, by pymavlink. Source: the MAVLink 2 guide on message signing.
-
-    signed, unsigned   how many were, and how many could not be: MAVLink 1, and messages the dialect lacks
-    """
-
-    def __init__(self, key: bytes, link_id: int = 0) -> None:
-        self.signed = self.unsigned = 0
-        self._mavlink = common.MAVLink(None)
-        self._mavlink.signing.secret_key = key
-        self._mavlink.signing.link_id = link_id
-
-    def sign(self, frame: bytes, now_us: int) -> bytes:
-        """The frame, signed at now_us since 1970; a signature that it had is replaced."""
-        number, _, header = _identity(frame)
-        message = layouts().get(number)
-        if header == HEADER_V1 or message is None:
-            self.unsigned += 1
-            return frame
-        signing = self._mavlink.signing
-        signing.timestamp = max(signing.timestamp, (now_us - _EPOCH_2015_US) // 10)  # in units of 10 us; never back
-        end = header + frame[1]
-        body = bytes((frame[1], frame[2] | SIGNED)) + frame[3:end]
-        packet = common.MAVLink_message.__new__(common.MAVLink_message)
-        packet._msgbuf = bytearray(frame[:1] + body + _crc(body + message.crc_seed).to_bytes(CRC_SIZE, "little"))
-        packet.sign_packet(self._mavlink)
-        self.signed += 1
-        return bytes(packet._msgbuf)
+    body = bytes(body)
+    return frame[:1] + body + checksum(body, 0, len(body), message.crc_seed).to_bytes(CRC_SIZE, "little")

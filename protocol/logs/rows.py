@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.compiled import compiled
-from protocol.logs.records import SIMULATION_OR_DATE_US, Bytes, State, Table, byte
+from protocol.logs.records import SIMULATION_OR_DATE_US, State
+from protocol.wire.framing import Bytes, Output, Table, byte
 
 _DAY_US = 86_400_000_000
 _MINUTE_US = 60_000_000
@@ -79,7 +80,7 @@ def fill_rows(
     places: State,
     sizes: State,
     head: int,
-    rows: Bytes,
+    rows: Output,
 ) -> None:
     """Copy each frame that `count_rows` counts into the row at `places` of its slot, which then moves on.
 

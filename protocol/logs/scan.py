@@ -37,6 +37,7 @@ from protocol.errors import LogError
 from protocol.logs import records, scan_kernels
 from protocol.logs.dialect import layouts
 from protocol.logs.rows import mend_stamps
+from protocol.wire.framing import KNOWN, SIZE_SHIFT, Table
 
 Progress = Callable[[int, int], None]
 """Is told how much of how much is done."""
@@ -106,10 +107,7 @@ class Scan:
 @functools.cache
 def _known_messages() -> npt.NDArray[np.int32]:
     """The ids that the dialect has, and the entry of each in the kernel's table: shape (2, messages)."""
-    entries = [
-        (number, records.KNOWN | message.size << records.SIZE_SHIFT | message.crc_seed[0])
-        for number, message in layouts().items()
-    ]
+    entries = [(number, KNOWN | message.size << SIZE_SHIFT | message.crc_seed) for number, message in layouts().items()]
     return np.array(entries, dtype=np.int32).T
 
 
@@ -143,7 +141,7 @@ def _bytes_of(path: Path) -> npt.NDArray[np.uint8]:
 
 
 def _scan(
-    data: npt.NDArray[np.uint8], stamp_size: int, table: records.Table, progress: Progress | None
+    data: npt.NDArray[np.uint8], stamp_size: int, table: Table, progress: Progress | None
 ) -> tuple[npt.NDArray[np.void], records.State]:
     frames: npt.NDArray[Any] = np.empty(len(data) // 48 + 1024, dtype=records.FRAME)
     votes = np.zeros(records.IDS, dtype=np.int32)

@@ -15,24 +15,19 @@ import numpy.typing as npt
 
 from protocol.compiled import compiled, inlined
 from protocol.logs.candidates import best_of_overlapping, may_begin, unknown_fits
-from protocol.logs.records import (
+from protocol.logs.records import LEARNED, LEARNED_SHIFT, OWN, State, checksum_verdict, near, stamp_at
+from protocol.wire.framing import (
     KNOWN,
-    LEARNED,
-    LEARNED_SHIFT,
-    OWN,
     SIZE_SHIFT,
     Bytes,
-    State,
     Table,
     byte,
-    checksum_verdict,
     crc_of,
     frame_end,
     message_of,
-    near,
+    seeded,
     signature_size,
-    stamp_at,
-    table_entry,
+    uint16_at,
 )
 
 (
@@ -94,7 +89,7 @@ def take_run(
 ) -> None:
     """The way through a log without damage: records of known messages, one behind the other. Stops before any other."""
     floor, count, last, raw, signature = state[POSITION], state[COUNT], state[LAST_STAMP], state[RAW_STAMP], 0
-    size, room = data.shape[0] - 12, frames.shape[0]
+    size, room = len(data) - 12, frames.shape[0]
     begun = count
     while floor < until and count < room:
         at = floor + stamp_size
@@ -107,9 +102,7 @@ def take_run(
             break
         if data[np.uint64(at)] == 0xFE and end - at - 6 > (entry >> SIZE_SHIFT & 0xFF):
             break
-        crc = crc_of(data, at + 1, end)
-        crc = (crc >> 8) ^ table_entry(0, (crc ^ entry) & 0xFF)
-        if crc != (byte(data, end) | byte(data, end + 1) << 8):
+        if seeded(crc_of(data, at + 1, end), entry & 0xFF) != uint16_at(data, end):
             break
         stamp = -1
         if stamp_size:
@@ -223,7 +216,7 @@ def take(data: Bytes, at: int, verdict: int, stamp_size: int, state: State, fram
 @compiled
 def is_cut_short(data: Bytes, floor: int, stamp_size: int) -> bool:
     """Whether what is left from `floor` on is the beginning of a record that the end of the file cuts short."""
-    at, count = floor + stamp_size, data.shape[0]
+    at, count = floor + stamp_size, len(data)
     if at >= count:
         return bool(count > floor)
     if data[at] != 0xFD and data[at] != 0xFE:

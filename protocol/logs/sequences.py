@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from protocol.compiled import compiled
 from protocol.logs.scan import Scan
-from protocol.wire.codec import HALF_SEQUENCE
+from protocol.wire.framing import HALF_SEQUENCE
 
 
 @compiled

@@ -24,11 +24,11 @@ import dronecan
 from dronecan import transport
 
 from protocol.can_frame import CanFrame
+from protocol.due import Due
 from protocol.messages import AXES, FloatArray
 from protocol.motors import motor_protocol
 from protocol.motors.motor_protocol import AXIS_NUMBERS, DRIVES, Action, Cause, Order, Reading, Status, Traffic
 from protocol.scenario import NANOSECONDS, Motor
-from protocol.wire.streams import Due
 
 HOST_NODE = 120
 RAW_COMMAND = 1030

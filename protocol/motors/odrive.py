@@ -21,11 +21,11 @@ import struct
 from collections.abc import Sequence
 
 from protocol.can_frame import CanFrame
+from protocol.due import Due
 from protocol.messages import FloatArray
 from protocol.motors import motor_protocol
 from protocol.motors.motor_protocol import AXIS_NUMBERS, DRIVES, Action, Cause, Fault, Order, Reading, Status, Traffic
 from protocol.scenario import Motor
-from protocol.wire.streams import Due
 
 HEARTBEAT = 0x01
 ESTOP = 0x02

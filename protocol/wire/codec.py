@@ -1,6 +1,4 @@
-"""MAVLink 2 frames: layout, checksum, sequence. The layouts are generated from pymavlink's `common` dialect.
-
-    frame   FD | length | incompat | compat | sequence | system | component | id (3 bytes) | payload | CRC | [signature 13]
+"""MAVLink frames for callers in Python: layouts, generated from pymavlink's `common` dialect, a writer and a reader.
 
 `FrameWriter` numbers and seals frames; `FrameReader` finds them in whatever bytes arrive. A frame that cannot be taken is
 an event with a cause, counted in `FrameReader.counters`, never an exception. Source: the MAVLink 2 serialization guide.
@@ -13,25 +11,15 @@ import struct
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
-import fastcrc
 import numpy as np
 from pymavlink.dialects.v20 import common
 
-MAGIC_V2 = 0xFD
-MAGIC_V1 = 0xFE
-HEADER_V2 = 10
-HEADER_V1 = 6
-CRC_SIZE = 2
-SIGNATURE_SIZE = 13
-SIGNED = 0x01
-LONGEST_FRAME = HEADER_V2 + 255 + CRC_SIZE + SIGNATURE_SIZE
-HALF_SEQUENCE = 128
-_SHORTEST_FRAME = HEADER_V2 + 1 + CRC_SIZE
+from protocol.wire import framing
+from protocol.wire.framing import CAUSES, CRC_SIZE, HEADER_V2, KNOWN, LONGEST_FRAME, MAGIC_V2, SIZE_SHIFT, Table
 
-_crc = fastcrc.crc16.mcrf4xx
 _unpack_header = struct.Struct("<xBBxBBBHB").unpack_from  # without magic and compat; the id is 24 bits: 16 and 8
-_MAGIC = bytes([MAGIC_V2])
-
+_AT_ONCE = 256
+"""Frames that one look at the bytes describes; a datagram of more takes several."""
 
 _NUMBERS = {"uint8_t": "u1", "uint16_t": "<u2", "uint32_t": "<u4", "uint64_t": "<u8", "float": "<f4"}
 _NUMBERS |= {"int8_t": "i1", "int16_t": "<i2", "int32_t": "<i4", "int64_t": "<i8", "double": "<f8"}
@@ -65,7 +53,7 @@ class Layout:
         self.structure: struct.Struct = message.unpacker
         self.size: int = self.structure.size
         self.id_bytes: bytes = self.message_id.to_bytes(3, "little")
-        self.crc_seed = bytes([message.crc_extra])
+        self.crc_seed: int = message.crc_extra
         self.pack: Callable[..., bytes] = self.structure.pack
         self._unpack: Callable[[bytes], tuple[Any, ...]] = self.structure.unpack
         self.dtype = np.dtype([_column(field, kinds[field], length)
@@ -138,35 +126,34 @@ class FrameWriter:
         self.system = system
         self.component = component
         self.sequence = 0
+        self._out = np.zeros(LONGEST_FRAME, dtype=np.uint8)
 
     def seal(self, message: Layout, payload: bytes) -> bytes:
         """One frame: trailing zeros of the payload cut off (one byte stays), header, checksum."""
-        payload = payload.rstrip(b"\0") or b"\0"
-        sequence = self.sequence
-        body = bytes((len(payload), 0, 0, sequence, self.system, self.component)) + message.id_bytes + payload
+        sequence, out = self.sequence, self._out
+        end = framing.seal_frame(
+            out, 0, payload, 0, sequence, self.system, self.component, message.message_id, message.crc_seed
+        )
         self.sequence = (sequence + 1) & 0xFF
-        checksum: int = _crc(body + message.crc_seed)
-        return _MAGIC + body + checksum.to_bytes(CRC_SIZE, "little")
+        return out[:end].tobytes()
 
 
-def _frame_of_mavlink1(raw: bytes) -> Frame:
-    return Frame(raw[5], raw[2], raw[3], raw[4], raw[HEADER_V1:-CRC_SIZE], raw)
+def table_of(messages: Iterable[Layout], ids: int) -> Table:
+    """The table of messages (ids,) that frames are checked against."""
+    table = np.zeros(ids, dtype=np.int32)
+    for message in messages:
+        table[message.message_id] = KNOWN | message.size << SIZE_SHIFT | message.crc_seed
+    return table
 
 
-CAUSES = (
-    "bad_crc",
-    "garbage_bytes",
-    "unknown_message",
-    "unknown_flags",
-    "truncated",
-    "mavlink1",
-    "sequence_gaps",
-    "out_of_order",
-)
+@functools.cache
+def link_table() -> Table:
+    """The table of the dialect that is spoken on links."""
+    return table_of(layouts_by_id().values(), 1 << 16)
 
 
 class FrameReader:
-    """Finds the frames in what a link delivers, and counts by cause what it cannot take.
+    """Finds the frames in what a link delivers, and counts by cause what it cannot take; see `framing.next_frame`.
 
     counters   bad_crc          frames whose checksum failed
                garbage_bytes    bytes that belong to no frame
@@ -178,123 +165,67 @@ class FrameReader:
                out_of_order     frames that came again, or late
 
     With follow_sequence False the last two count from the first call of `restart_sequences` on. With keep_mavlink1 True
-    MAVLink 1 frames of known messages are handed on too (for recorders), besides being counted.
+    MAVLink 1 frames are handed on too (for recorders), besides being counted.
+
+    reading, table, rows   what a kernel that reads frames itself gives to `framing.next_frame`; it begins with `whole` and
+                           ends with `keep_rest`
     """
 
     def __init__(self, *, is_datagram: bool, follow_sequence: bool = True, keep_mavlink1: bool = False) -> None:
+        self.reading = framing.new_reading(
+            is_datagram=is_datagram, follow_sequence=follow_sequence, keep_mavlink1=keep_mavlink1
+        )
+        self.table = link_table()
+        self.rows = np.zeros(_AT_ONCE, dtype=framing.ROW)
         self._is_datagram = is_datagram
-        self._keep_mavlink1 = keep_mavlink1
-        self._follow_sequence = follow_sequence
         self._rest = b""
-        self._next: dict[tuple[int, int], int] = {}
-        self._layouts = layouts_by_id()
-        self.counters: dict[str, int] = dict.fromkeys(CAUSES, 0)
+        self._counted, self._next = self.reading["counters"][0], self.reading["next"][0]
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """What was counted so far, by cause."""
+        return dict(zip(CAUSES, self._counted.tolist(), strict=True))
 
     def restart_sequences(self, expected: Iterable[tuple[int, int, int]] = ()) -> None:
         """Forget the numbers seen; `expected` gives (system, component, next number) where they are known."""
-        self._follow_sequence = True
-        self._next = {(system, component): number & 0xFF for system, component, number in expected}
+        self.reading["follow"] = 1
+        self._next[:] = -1
+        for system, component, number in expected:
+            self._next[system << 8 | component] = number & 0xFF
+
+    def whole(self, data: bytes) -> bytes:
+        """`data` behind what is left of a frame begun before, on a stream."""
+        if self._rest:
+            data, self._rest = self._rest + data, b""
+        return data
+
+    def keep_rest(self, data: bytes) -> None:
+        """Keep the unfinished frame at the end of `data`, all of which has been read, on a stream."""
+        if not self._is_datagram:
+            self._rest = data[self.reading["rest"].item() :]
 
     def read(self, data: bytes) -> list[Frame]:
         """The intact frames in `data`; on a stream link, a frame begun in one call is completed in the next."""
-        if self._rest:
-            data = self._rest + data
-            self._rest = b""
-        at, end = 0, len(data)
-        if end >= _SHORTEST_FRAME and data[0] == MAGIC_V2 and data[1] == end - HEADER_V2 - CRC_SIZE and not data[2]:
-            frame = self._check(data, 0, end)  # the plain case: just one frame, unsigned
-            if frame is not None:
-                return [frame]
-            at = 1
-        frames: list[Frame] = []
-        while at < end:
-            if data[at] != MAGIC_V2:
-                if self._keep_mavlink1 and data[at] == MAGIC_V1:
-                    if not self._is_datagram and (at + 2 > end or at + HEADER_V1 + data[at + 1] + CRC_SIZE > end):
-                        self._rest = data[at:]
-                        break
-                    before, start = self.counters["mavlink1"], at
-                    at = self._skip_garbage(data, at)
-                    if self.counters["mavlink1"] > before:
-                        frames.append(_frame_of_mavlink1(data[start:at]))
-                    continue
-                at = self._skip_garbage(data, at)
-                continue
-            size = self.frame_size(data, at)
-            if size == 0 or at + size > end:
-                if not self._is_datagram:
-                    self._rest = data[at:]
-                    break
-                self.counters["truncated"] += 1
-                at += 1
-                continue
-            frame = self._check(data, at, size)
-            if frame is None:
-                at += 1
-            else:
-                frames.append(frame)
-                at += size
+        data = self.whole(data)
+        count, at = framing.read_frames(data, 0, self.reading, self.table, self.rows)
+        if count == 1 and data[0] == MAGIC_V2 and len(data) == data[1] + HEADER_V2 + CRC_SIZE:
+            return [lone_frame(data)]  # as nearly always
+        frames = [frame_of(data, row) for row in self.rows[:count].tolist()]
+        while at >= 0:
+            count, at = framing.read_frames(data, at, self.reading, self.table, self.rows)
+            frames += [frame_of(data, row) for row in self.rows[:count].tolist()]
+        self.keep_rest(data)
         return frames
 
-    def frame_size(self, data: bytes, at: int) -> int:
-        """Size of the frame that begins at `at`, 0 where its header is not complete."""
-        if at + 3 > len(data):
-            return 0
-        return HEADER_V2 + data[at + 1] + CRC_SIZE + (SIGNATURE_SIZE if data[at + 2] & SIGNED else 0)
 
-    def _check(self, data: bytes, at: int, size: int) -> Frame | None:
-        """The frame of that size at `at`, or None (counted) where it is none."""
-        length, flags, sequence, system, component, number, high = _unpack_header(data, at)
-        if high:
-            number |= high << 16
-        message = self._layouts.get(number)
-        stop = at + HEADER_V2 + length
-        if message is None:
-            # Its checksum cannot be verified: believe the length only where the next frame, or nothing, follows it.
-            if at + size < len(data) and data[at + size] not in (MAGIC_V2, MAGIC_V1):
-                self.counters["bad_crc"] += 1
-                return None
-            self.counters["unknown_message"] += 1
-        elif _crc(data[at + 1 : stop] + message.crc_seed) != data[stop] | data[stop + 1] << 8:
-            self.counters["bad_crc"] += 1
-            return None
-        if flags & ~SIGNED:
-            self.counters["unknown_flags"] += 1
-            return None
-        if self._follow_sequence:
-            key = (system, component)
-            if self._next.get(key) == sequence:  # in line, as nearly always
-                self._next[key] = (sequence + 1) & 0xFF
-            else:
-                self._follow(key, sequence)
-        raw = data if size == len(data) else data[at : at + size]
-        return _new_frame(Frame, (number, sequence, system, component, data[at + HEADER_V2 : stop], raw))
+def lone_frame(data: bytes) -> Frame:
+    """The MAVLink 2 frame that is all of `data`, unsigned, already found to be intact."""
+    length, _, sequence, system, component, number, high = _unpack_header(data, 0)
+    number |= high << 16
+    return _new_frame(Frame, (number, sequence, system, component, data[HEADER_V2 : HEADER_V2 + length], data))
 
-    def expected(self, sender: tuple[int, int]) -> int:
-        """The number of the next frame of a (system, component); -1 where it is not followed, or a frame is half read."""
-        return -1 if self._rest else self._next.get(sender, -1)
 
-    def expect(self, sender: tuple[int, int], number: int) -> None:
-        """Have `number` expected next of a sender whose frames were read elsewhere."""
-        self._next[sender] = number & 0xFF
-
-    def _follow(self, key: tuple[int, int], sequence: int) -> None:
-        ahead = (sequence - self._next.get(key, sequence)) & 0xFF
-        if ahead < HALF_SEQUENCE:
-            self.counters["sequence_gaps"] += ahead
-            self._next[key] = (sequence + 1) & 0xFF
-        else:
-            self.counters["out_of_order"] += 1
-
-    def _skip_garbage(self, data: bytes, at: int) -> int:
-        """Where the next frame may begin; MAVLink 1 frames are told from garbage by their checksum."""
-        if data[at] == MAGIC_V1 and at + HEADER_V1 + CRC_SIZE <= len(data):
-            stop = at + HEADER_V1 + data[at + 1]
-            message = self._layouts.get(data[at + 5])
-            if message and stop + CRC_SIZE <= len(data):
-                crc = _crc(data[at + 1 : stop] + message.crc_seed)
-                if crc == data[stop] | data[stop + 1] << 8:
-                    self.counters["mavlink1"] += 1
-                    return stop + CRC_SIZE
-        self.counters["garbage_bytes"] += 1
-        return at + 1
+def frame_of(data: bytes, row: tuple[int, ...]) -> Frame:
+    """The frame in `data` that a row of `framing.ROW` describes."""
+    number, offset, end, first, length, sequence, system, component = row
+    return _new_frame(Frame, (number, sequence, system, component, data[first : first + length], data[offset:end]))

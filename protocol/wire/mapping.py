@@ -11,14 +11,13 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from pymavlink.dialects.v20 import common
 
 from protocol.can_frame import EXTENDED_IDS, LONGEST_DATA, STANDARD_IDS, CanFrame
 from protocol.compiled import Packed, compiled
 from protocol.messages import ActuatorCommand, FloatArray, PositionSample
 from protocol.rotations import euler_from_quaternion, quaternion_from_euler
-from protocol.wire.codec import layout
+from protocol.wire.codec import Layout, layout
 
 POSE = layout("ATT_POS_MOCAP")
 TICK = layout("HIL_SENSOR")
@@ -41,12 +40,8 @@ LOCKSTEP_FLAG = 1
 ARMED = common.MAV_MODE_FLAG_SAFETY_ARMED
 HIL = common.MAV_MODE_FLAG_HIL_ENABLED
 _CUSTOM = common.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-POSE_READ = 8 + 7 * 4
-"""Bytes of ATT_POS_MOCAP that are read: time, quaternion and position come first on the wire, in this order."""
 TICK_BASE = 64
 """Size of HIL_SENSOR without its extension, the instance id."""
-COMMAND_MODE = 80
-"""Where HIL_ACTUATOR_CONTROLS has its mode: after time, flags and controls."""
 
 
 @compiled
@@ -92,11 +87,12 @@ def fill_pose(message: Any, t_us: int, q: FloatArray) -> None:
 
 
 @compiled
-def pose_of_values(values: npt.NDArray[np.float32], q: FloatArray) -> bool:
-    """Fill q (6,) from the seven float32 of ATT_POS_MOCAP in wire order; False where they are no pose."""
+def read_pose(message: Any, q: FloatArray) -> bool:
+    """Fill q (6,) from an ATT_POS_MOCAP structure; False where it holds no pose."""
     wire = np.empty(7)
-    for i in range(7):
-        wire[i] = values[i]
+    for i in range(4):
+        wire[i] = message.q[i]
+    wire[4], wire[5], wire[6] = message.x, message.y, message.z
     length_squared = wire[0] * wire[0] + wire[1] * wire[1] + wire[2] * wire[2] + wire[3] * wire[3]
     if not abs(length_squared - 1.0) < 2.0 * UNIT_TOLERANCE:  # written so that NaN fails it
         return False
@@ -137,11 +133,11 @@ def fill_command(message: Any, t_us: int, tau: FloatArray, scale: FloatArray, ar
 
 
 @compiled
-def tau_of_controls(controls: npt.NDArray[np.float32], scale: FloatArray, tau: FloatArray) -> bool:
-    """Fill tau (6,) from the first six controls; False where one is not finite."""
+def read_command(message: Any, scale: FloatArray, tau: FloatArray) -> bool:
+    """Fill tau (6,) from the first six controls of a HIL_ACTUATOR_CONTROLS structure; False where one is not finite."""
     total = 0.0
     for i in range(6):
-        tau[i] = command_from_wire(float(controls[i]), scale[i])
+        tau[i] = command_from_wire(float(message.controls[i]), scale[i])
         total += tau[i]
     return math.isfinite(total)
 
@@ -175,6 +171,21 @@ def _fill_command_packed(
     fill_command(message[0], t_us, tau, scale, armed, lockstep)
 
 
+@compiled
+def _read_pose_packed(message: Packed, q: FloatArray) -> bool:
+    return read_pose(message[0], q)
+
+
+@compiled
+def _read_command_packed(message: Packed, scale: FloatArray, tau: FloatArray) -> bool:
+    return read_command(message[0], scale, tau)
+
+
+def _structure(message: Layout, payload: bytes) -> Packed:
+    """A payload as the structure of its message; zeros that were cut off return."""
+    return np.frombuffer(payload.ljust(message.size, b"\0"), message.dtype, 1)
+
+
 def encode_pose(t_ns: int, q: FloatArray) -> bytes:
     """ATT_POS_MOCAP payload of the position and attitude q (6,)."""
     message = np.zeros(1, POSE.dtype)
@@ -184,12 +195,8 @@ def encode_pose(t_ns: int, q: FloatArray) -> bytes:
 
 def decode_pose(payload: bytes) -> PositionSample | None:
     """The sample, or None where a position is not finite or the quaternion not of unit length."""
-    if len(payload) < POSE_READ:
-        payload = payload.ljust(POSE_READ, b"\0")
-    q = np.empty(6)
-    if not pose_of_values(np.frombuffer(payload, "<f4", 7, 8), q):
-        return None
-    return PositionSample(int.from_bytes(payload[:8], "little") * 1000, q)
+    message, q = _structure(POSE, payload), np.empty(6)
+    return PositionSample(int(message["time_usec"][0]) * 1000, q) if _read_pose_packed(message, q) else None
 
 
 def encode_tick(t_ns: int, readings: FloatArray) -> bytes:
@@ -253,12 +260,15 @@ def encode_command(command: ActuatorCommand, scale: FloatArray, *, lockstep: boo
 
 def decode_command(payload: bytes, scale: FloatArray) -> ActuatorCommand | None:
     """The command, or None where a control of the six is not finite; scale (6,)."""
-    if len(payload) < COMMAND.size:
-        payload = payload.ljust(COMMAND.size, b"\0")
-    tau = np.empty(6)
-    if not tau_of_controls(np.frombuffer(payload, "<f4", 6, 16), np.asarray(scale, dtype=float), tau):
+    message, tau = _structure(COMMAND, payload), np.empty(6)
+    if not _read_command_packed(message, np.asarray(scale, dtype=float), tau):
         return None
-    return ActuatorCommand(int.from_bytes(payload[:8], "little") * 1000, tau, payload[COMMAND_MODE] & ARMED != 0)
+    return ActuatorCommand(int(message["time_usec"][0]) * 1000, tau, bool(message["mode"][0] & ARMED))
+
+
+def is_armed(payload: bytes) -> bool:
+    """Whether the command in a HIL_ACTUATOR_CONTROLS may act."""
+    return bool(_structure(COMMAND, payload)["mode"][0] & ARMED)
 
 
 def encode_controller_heartbeat(*, armed: bool, ending: bool = False) -> bytes:

@@ -11,12 +11,14 @@ from __future__ import annotations
 import enum
 import hashlib
 import hmac
+import re
+from collections.abc import Mapping
+from pathlib import Path
 
-import fastcrc
+from protocol.errors import UsageError
+from protocol.wire.codec import Layout, layouts_by_id
+from protocol.wire.framing import CRC_SIZE, HEADER_V2, MAGIC_V2, SIGNATURE_SIZE, SIGNED, checksum, message_of
 
-from protocol.wire.codec import CRC_SIZE, HEADER_V2, SIGNATURE_SIZE, SIGNED, Frame, layouts_by_id
-
-_crc = fastcrc.crc16.mcrf4xx
 _EPOCH_2015_US = 1_420_070_400_000_000
 _TICK_US = 10
 _MINUTE = 60_000_000 // _TICK_US
@@ -33,54 +35,73 @@ class Verdict(enum.Enum):
     OLD = "old_signature"
 
 
-def strip(frame: Frame) -> bytes | None:
+def read_key(path: Path) -> bytes:
+    """The signing key in a file: 64 hexadecimal digits, or the 32 bytes themselves. Raises UsageError."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UsageError(f"cannot read the signing key {path}: {error.strerror}") from None
+    if re.fullmatch(rb"\s*[0-9a-fA-F]{64}\s*", data):
+        return bytes.fromhex(data.decode())
+    if len(data) == 32:
+        return data
+    raise UsageError(f"{path} holds no signing key: it must be 64 hexadecimal digits, or 32 bytes")
+
+
+def _with_flags(raw: bytes, flags: int, message: Layout) -> bytes:
+    """The MAVLink 2 frame with other incompatibility flags, its checksum made to fit, and without a signature."""
+    stop = HEADER_V2 + raw[1]
+    body = raw[:2] + bytes((flags,)) + raw[3:stop]
+    return body + checksum(body, 1, stop, message.crc_seed).to_bytes(CRC_SIZE, "little")
+
+
+def strip(raw: bytes) -> bytes | None:
     """The frame without its signature; None where its message is not known, so that no checksum can be made for it."""
-    message = layouts_by_id().get(frame.message_id)
-    if message is None:
-        return None
-    raw = frame.raw
-    body = bytes((raw[1], raw[2] & ~SIGNED)) + raw[3 : HEADER_V2 + raw[1]]
-    checksum: int = _crc(body + message.crc_seed)
-    return raw[:1] + body + checksum.to_bytes(CRC_SIZE, "little")
+    message = layouts_by_id().get(message_of(raw, 0))
+    return _with_flags(raw, raw[2] & ~SIGNED, message) if message else None
 
 
 class Signatures:
     """Signs what one end of a link says, and verifies what it hears, with the key of both.
 
-    now_us is the time since 1970.
+    now_us is the time since 1970; messages: those that can be signed, by default those of the links' dialect.
+
+    signed, unsigned   how many frames were, and how many could not be: MAVLink 1, and those of other messages
     """
 
-    def __init__(self, key: bytes, link_id: int = 0) -> None:
+    def __init__(self, key: bytes, link_id: int = 0, messages: Mapping[int, Layout] | None = None) -> None:
+        self.signed = self.unsigned = 0
+        self._messages = layouts_by_id() if messages is None else messages
         self._key = key
         self._link_id = link_id
         self._stamp = 0
         self._newest: dict[tuple[int, int, int], int] = {}
 
-    def sign(self, frame: Frame, now_us: int) -> bytes:
-        """The frame, signed; a message that is not known goes as it is."""
-        plain = strip(frame)
-        if plain is None:
-            return frame.raw
-        message = layouts_by_id()[frame.message_id]
+    def sign(self, raw: bytes, now_us: int) -> bytes:
+        """The frame, signed, a signature that it had replaced; one that cannot be signed stays as it is."""
+        message = self._messages.get(message_of(raw, 0)) if raw[0] == MAGIC_V2 else None
+        if message is None:
+            self.unsigned += 1
+            return raw
+        self.signed += 1
         self._stamp = max(self._stamp + 1, (now_us - _EPOCH_2015_US) // _TICK_US)
-        body = bytes((plain[1], plain[2] | SIGNED)) + plain[3:-CRC_SIZE]
-        checksum: int = _crc(body + message.crc_seed)
-        signed = plain[:1] + body + checksum.to_bytes(CRC_SIZE, "little")
-        stamped = signed + bytes((self._link_id,)) + self._stamp.to_bytes(_STAMP, "little")
-        return stamped + hashlib.sha256(self._key + stamped).digest()[:_DIGEST]
+        stamp = bytes((self._link_id,)) + self._stamp.to_bytes(_STAMP, "little")
+        stamped = _with_flags(raw, raw[2] | SIGNED, message) + stamp
+        return stamped + self._digest(stamped)
 
-    def verify(self, frame: Frame, now_us: int) -> Verdict:
-        """Whether a frame that was received may be believed; a good one's time becomes its stream's newest."""
-        raw = frame.raw
-        if not raw[2] & SIGNED or len(raw) != HEADER_V2 + raw[1] + CRC_SIZE + SIGNATURE_SIZE:
+    def verify(self, raw: bytes, now_us: int) -> Verdict:
+        """Whether an intact frame that was received may be believed; a good one's time becomes its stream's newest."""
+        if raw[0] != MAGIC_V2 or not raw[2] & SIGNED or len(raw) != HEADER_V2 + raw[1] + CRC_SIZE + SIGNATURE_SIZE:
             return Verdict.MISSING
-        digest = hashlib.sha256(self._key + raw[:-_DIGEST]).digest()[:_DIGEST]
-        if not hmac.compare_digest(digest, raw[-_DIGEST:]):
+        if not hmac.compare_digest(self._digest(raw[:-_DIGEST]), raw[-_DIGEST:]):
             return Verdict.BAD
-        stream = (frame.system, frame.component, raw[-SIGNATURE_SIZE])
+        stream = (raw[5], raw[6], raw[-SIGNATURE_SIZE])
         stamp = int.from_bytes(raw[-_DIGEST - _STAMP : -_DIGEST], "little")
         newest = self._newest.get(stream, (now_us - _EPOCH_2015_US) // _TICK_US - _MINUTE)
         if stamp <= newest:
             return Verdict.OLD
         self._newest[stream] = stamp
         return Verdict.GOOD
+
+    def _digest(self, stamped: bytes) -> bytes:
+        return hashlib.sha256(self._key + stamped).digest()[:_DIGEST]

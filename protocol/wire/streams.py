@@ -9,7 +9,8 @@ import enum
 from collections.abc import Iterator
 from typing import NamedTuple
 
-NANOSECONDS = 1_000_000_000
+from protocol.due import NANOSECONDS
+
 HEARTBEAT_TIMEOUT_NS = 3 * NANOSECONDS
 
 
@@ -45,14 +46,14 @@ STREAMS = (
     Stream(
         "HIL_ACTUATOR_CONTROLS", End.CONTROLLER, None, "one for each tick; time_usec echoes the sample it answers", True
     ),
-    Stream("POSITION_TARGET_LOCAL_NED", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
-    Stream("ATTITUDE_TARGET", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
     Stream(
         "PARAM_VALUE",
         End.CONTROLLER,
         None,
         "gains, scales, limits, gears: each once at the start, for the log, and when changed; to a ground station on request",
     ),
+    Stream("POSITION_TARGET_LOCAL_NED", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
+    Stream("ATTITUDE_TARGET", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
     Stream("PARAM_REQUEST_LIST", End.STATION, None, "to the controller, on its station's link: all of them"),
     Stream("PARAM_REQUEST_READ", End.STATION, None, "one of them"),
     Stream("PARAM_SET", End.STATION, None, "a gain, while disarmed"),
@@ -93,24 +94,6 @@ def stream(message: str) -> Stream:
         if row.message == message:
             return row
     raise KeyError(f"no stream {message}")
-
-
-class Due:
-    """Says when a periodic stream is due, in the time it is asked with: first at once, then each period.
-
-    next_ns   until then it is not due
-    """
-
-    def __init__(self, rate_hz: float) -> None:
-        self._period_ns = round(NANOSECONDS / rate_hz)
-        self.next_ns = 0
-
-    def at(self, t_ns: int) -> bool:
-        """Whether the stream is due at `t_ns`; asking so also marks it as sent."""
-        if t_ns < self.next_ns:
-            return False
-        self.next_ns = (t_ns // self._period_ns + 1) * self._period_ns
-        return True
 
 
 def markdown_table() -> Iterator[str]:

@@ -11,7 +11,8 @@ from bridge.links.link import Link
 from bridge.links.memory import memory_pair
 from protocol.errors import LinkClosedError, ScenarioMismatchError
 from protocol.messages import VEHICLE
-from protocol.wire.codec import CAUSES, layout
+from protocol.wire.codec import layout
+from protocol.wire.framing import CAUSES
 
 EMULATOR = (1, 191)
 HEARTBEAT, STATUSTEXT = layout("HEARTBEAT"), layout("STATUSTEXT")

@@ -42,7 +42,7 @@ def commands(scenario: Scenario, generator: random.Random | None) -> list[bytes]
     near, far = memory_pair()
     answers: list[bytes] = []
     law = make_law(scenario.law, scenario)
-    warm_up(law)
+    warm_up(scenario, law)
     options = ControllerOptions(link="-", wait_s=10.0)
     thread = threading.Thread(target=lambda: serve(scenario, law, far, options, lambda _event: None, StopFlag()))
     with near, far:

@@ -16,6 +16,7 @@ from controller.laws.registry import LAWS
 from controller.parameters import Parameters, changed, markdown_table, parameters_of, value_of
 from controller.station.parameter_server import BURST, ParameterServer
 from protocol.errors import ScenarioError, UsageError
+from protocol.messages import VEHICLE
 from protocol.scenario import Scenario
 from protocol.wire.codec import FrameReader, FrameWriter
 from protocol.wire.parameter_mapping import Kind, Refusal, decode_value
@@ -37,7 +38,7 @@ class Peer:
         self.parameters = new()
         self.told: list[int] = []
         self.armed = armed
-        self.server = ParameterServer(self.parameters, lambda: self.armed, self.told.append)
+        self.server = ParameterServer(self.parameters, VEHICLE, lambda: self.armed, self.told.append)
         self._mavlink = common.MAVLink(None, 255, 190)
         self._reader = FrameReader(is_datagram=True)
         self._writer = FrameWriter(1, 1)

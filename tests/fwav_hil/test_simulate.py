@@ -15,7 +15,7 @@ from fwav_hil.simulate import Simulation, simulate
 from plant_emulator.plant.backlash import GearHysteresis
 from plant_emulator.plant.integrate import PENDING, Plant
 from plant_emulator.plant.safety import SafetyEnvelope
-from plant_emulator.plant.sensors import PositionSensor
+from plant_emulator.plant.sensors import PositionSensor, add_noise
 from protocol.errors import UsageError
 from protocol.messages import ActuatorCommand, FloatArray
 from protocol.scenario import Delay, Noise, Play, Scenario, find_scenario, load_scenario
@@ -195,17 +195,18 @@ def test_the_loop_is_the_parts_of_the_two_ends_put_together() -> None:
     actuators = msgspec.structs.replace(FLAPPER.actuators, scale=tuple(scale.tolist()))
     scenario = replaced(FLAPPER, duration_s=1.0, actuators=actuators)
     plant, law = Plant(scenario), make_law(scenario.law, scenario)
-    sensor, envelope = PositionSensor(scenario.noise, scenario.seed), SafetyEnvelope(scenario.actuators)
+    sensor, envelope = PositionSensor(scenario.seed), SafetyEnvelope(scenario.actuators)
     state = law.start()
-    rows = []
+    rows, measured = [], np.empty(6)
     for k in range(scenario.ticks):
         t_ns = k * scenario.period_ns
-        sample = mapping.decode_pose(mapping.encode_pose(t_ns, sensor.measure(t_ns, plant.state.motion).q))
+        add_noise(plant.state.motion, sensor.draw(1)[0], scenario.noise.position, scenario.noise.attitude, measured)
+        sample = mapping.decode_pose(mapping.encode_pose(t_ns, measured))
         assert sample is not None
         said = ActuatorCommand(sample.t_ns, law.step(state, sample.t_ns, sample.q), armed=True)
         heard = mapping.decode_command(mapping.encode_command(said, scale, lockstep=True), scale)
         assert heard is not None
-        plant.command(t_ns + scenario.delay_ns, envelope.accept(t_ns, heard))
+        plant.command(t_ns + scenario.delay_ns, envelope.pass_command(t_ns, heard.tau, armed=heard.armed))
         plant.apply_due_commands()
         rows.append(np.concatenate((plant.state.motion, heard.tau, plant.state.tau, plant.state.u)))
         plant.advance(t_ns + scenario.period_ns)

@@ -61,7 +61,7 @@ def fly_on_small_disk(folder: Path, on_log_error: str) -> tuple[dict[str, Any] |
             warnings.append(event["text"])
 
     warm_up(SCENARIO)
-    controller_process.warm_up(law)
+    controller_process.warm_up(SCENARIO, law)
     options = EmulatorOptions(link="-", out=folder, on_log_error=on_log_error)
     with ThreadPoolExecutor(1) as thread:
         service = thread.submit(

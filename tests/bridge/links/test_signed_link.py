@@ -93,7 +93,7 @@ def test_a_signed_flight_is_the_same_flight_to_the_byte_whatever_a_stranger_says
     (frame,) = FrameReader(is_datagram=True).read(command)
 
     def with_a_stranger(count: int, data: bytes) -> list[bytes]:
-        return [command, forged.sign(frame, 1_800_000_000_000_000), data] if count % 5 == 0 else [data]
+        return [command, forged.sign(frame.raw, 1_800_000_000_000_000), data] if count % 5 == 0 else [data]
 
     with near, far:
         loud = Faulty(far, with_a_stranger)

@@ -17,8 +17,8 @@ from bridge.station import Station
 from bridge.timing.clock import VirtualClock
 from controller.laws.law import make_law
 from controller.parameters import Parameters, parameters_of
+from controller.session import HilSession
 from controller.station.ground_station import GroundStation
-from controller.vehicle import Vehicle
 from fwav_hil.replay.into_controller import replay_in_process
 from fwav_hil.replay.recorded_run import recorded_run
 from plant_emulator.plant.truth import load_truth
@@ -110,7 +110,7 @@ def test_nothing_is_set_while_armed() -> None:
     near, far = memory_pair()
     law = make_law("ude", ROOMY)
     parameters = Parameters(ROOMY, lambda other: law.adopt(make_law("ude", other)))
-    vehicle = Vehicle(Endpoint(memory_pair()[0], 1, 1), ROOMY.digest(), 191, arm=False, parameters=parameters)
+    vehicle = HilSession(Endpoint(memory_pair()[0], 1, 1), ROOMY.digest(), (1, 191), arm=False, parameters=parameters)
     station = GroundStation(Station(near, (1, 1), VirtualClock(), lambda: b"\1"), vehicle, parameters)
     for armed, answer in ((True, "PARAM_ERROR"), (False, "PARAM_VALUE")):
         vehicle.armed = armed

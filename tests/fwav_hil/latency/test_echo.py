@@ -8,11 +8,10 @@ import pytest
 from bridge.links.link import open_link
 from fwav_hil.latency.echo import COMMAND_BYTES, TICK_BYTES
 from fwav_hil.latency.peers import EMULATOR, _child
-from protocol.messages import ActuatorCommand
 from protocol.wire import mapping
 from protocol.wire.codec import FrameWriter
-from protocol.wire.tick_frames import CommandWriter, TickWriter
 from tests.contracts.link_contract import receive
+from tests.frames import command_frame, tick_frames
 from tests.loop import scenario_of
 
 
@@ -27,11 +26,9 @@ def test_it_gives_back_the_first_bytes() -> None:
 
 def test_the_sizes_are_those_of_a_tick_and_its_command() -> None:
     scenario = scenario_of("flapper")
-    ticks = TickWriter(FrameWriter(*EMULATOR))
-    tick = ticks.frames(4_000_000, np.full(6, 0.123), np.full(13, 9.81))
+    tick = tick_frames(FrameWriter(*EMULATOR), 4_000_000, np.full(6, 0.123), np.full(13, 9.81))
     scale = np.array(scenario.actuators.scale)
-    commands = CommandWriter(FrameWriter(1, 1), scale, lockstep=False)
-    command = commands.frame(ActuatorCommand(4_000_000, 0.3 * scale, armed=True))
+    command = command_frame(FrameWriter(1, 1), 4_000_000, 0.3 * scale, scale, lockstep=False)
     assert mapping.COMMAND.message_id == 93
     assert len(command) == COMMAND_BYTES
-    assert sum(map(len, tick)) == TICK_BYTES
+    assert len(tick) == TICK_BYTES

@@ -14,11 +14,11 @@ from bridge.endpoint import Endpoint
 from bridge.links.link import Link
 from bridge.process import StopFlag
 from bridge.timing.clock import VirtualClock
-from plant_emulator.emulator import Emulator
 from plant_emulator.pacing.pacing import Parts
 from plant_emulator.pacing.real_time import RealTime
 from plant_emulator.plant.truth import TruthWriter
 from plant_emulator.process import warm_up
+from plant_emulator.tick import Emulator
 from protocol.errors import PeerLostError
 from protocol.messages import VEHICLE, ActuatorCommand
 from protocol.wire import mapping
@@ -107,11 +107,11 @@ def fly_some(
     endpoint = Endpoint(link, 1, SCENARIO.wire.emulator_component)
     with TruthWriter(path) as truth:
         emulator = Emulator(SCENARIO, endpoint, truth)
-        parts = Parts(emulator, endpoint, None, clock, StopFlag(), PERIOD_NS)
-        pacing = RealTime(parts, ticks=ticks, sleeps_through=sleeps_through)
+        parts = Parts(emulator, endpoint, None, clock, StopFlag(), PERIOD_NS, ticks)
+        pacing = RealTime(parts, sleeps_through=sleeps_through)
         clock.advance_ns(waited_ns)
         for tick in range(ticks):
-            pacing.exchange(tick, tick * PERIOD_NS)
+            pacing.exchange(tick * PERIOD_NS)
     return Flown(pacing, emulator, link, path)
 
 
@@ -125,7 +125,7 @@ def test_each_answer_acts_when_it_comes_and_none_is_stale(fly: Fly) -> None:
 def test_an_old_command_grows_stale_even_if_it_is_said_again_and_again(fly: Fly, repeats: bool) -> None:
     flown = fly(50, lambda writer, tick: [answer(writer, 0)] if repeats or tick == 0 else [])
     assert flown.emulator.safety.counters["stale"] == 1
-    assert flown.pacing.counters["repeated"] == (49 if repeats else 0)
+    assert flown.emulator.source.counters()["repeated"] == (49 if repeats else 0)
     assert flown.pacing.counters["unanswered"] == 49
     assert flown.emulator.plant.state.tau == pytest.approx(np.array(SCENARIO.actuators.safe))
 
@@ -142,7 +142,7 @@ def test_an_echo_of_a_time_never_sent_is_dropped_and_shuts_nothing_out(fly: Fly)
         return [answer(writer, 10**15)] if tick == 3 else [answer(writer, tick * PERIOD_NS)]
 
     flown = fly(50, answers)
-    assert flown.pacing.counters["unknown_echoes"] == 1
+    assert flown.emulator.source.counters()["unknown_echoes"] == 1
     assert flown.pacing.counters["unanswered"] == 1
     assert flown.emulator.safety.counters["stale"] == 0
 
@@ -151,7 +151,7 @@ def test_an_older_command_than_the_newest_is_dropped(fly: Fly) -> None:
     def answers(writer: FrameWriter, tick: int) -> list[bytes]:
         return [answer(writer, tick * PERIOD_NS), answer(writer, max(0, tick - 1) * PERIOD_NS)]
 
-    assert fly(20, answers).pacing.counters["old_commands"] == 19
+    assert fly(20, answers).emulator.source.counters()["old_commands"] == 19
 
 
 def test_a_long_wait_for_the_controller_is_not_held_against_it(fly: Fly) -> None:
@@ -191,21 +191,6 @@ def test_sleeping_through_a_period_changes_nothing_but_when_the_work_is_done(tmp
     assert slept.emulator.safety.counters == woken.emulator.safety.counters
 
 
-def test_a_plain_answer_takes_the_short_way_where_the_period_is_slept_through(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    long_way, taken = Emulator.act, []
-
-    def act(emulator: Emulator, arrival_ns: int, delay_ns: int, command: ActuatorCommand) -> None:
-        taken.append(arrival_ns // PERIOD_NS)
-        long_way(emulator, arrival_ns, delay_ns, command)
-
-    monkeypatch.setattr(Emulator, "act", act)
-    fly_some(tmp_path / "plain.npy", 40, lambda writer, tick: [answer(writer, tick * PERIOD_NS)], sleeps_through=True)
-    # That of the warm-up, the first, the last, and the one before HIL_GPS is due.
-    assert taken == [0, 0, 24, 39]
-
-
 def test_a_flood_does_not_stop_the_plant(tmp_path: Path) -> None:
     class Flooded(Scripted):
         def recv(self, timeout_s: float) -> bytes | None:
@@ -216,8 +201,8 @@ def test_a_flood_does_not_stop_the_plant(tmp_path: Path) -> None:
     link = Flooded(clock, lambda _tick: [])
     endpoint = Endpoint(link, 1, SCENARIO.wire.emulator_component)
     emulator = Emulator(SCENARIO, endpoint, None)
-    pacing = RealTime(Parts(emulator, endpoint, None, clock, StopFlag(), PERIOD_NS), ticks=5, sleeps_through=True)
+    pacing = RealTime(Parts(emulator, endpoint, None, clock, StopFlag(), PERIOD_NS, 5), sleeps_through=True)
     for tick in range(5):
-        pacing.exchange(tick, tick * PERIOD_NS)
+        pacing.exchange(tick * PERIOD_NS)
     assert emulator.plant.t_ns == 5 * PERIOD_NS
     assert len(link.sent) == 5

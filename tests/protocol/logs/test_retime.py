@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import struct
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common
 
-from protocol.errors import UsageError
-from protocol.logs.retime import TIME_FIELDS, Signer, TimeMover, read_key, time_fields
+from protocol.logs.retime import TIME_FIELDS, TimeMover, time_fields
 from protocol.logs.scan import Scan, scan_tlog
 from protocol.wire.codec import FrameWriter, layout
+from protocol.wire.signing import Signatures
 
 KEY = bytes(range(32))
 NOW_US = 1_795_000_000_000_000
@@ -133,62 +131,8 @@ class TestTimes:
                 assert np.array_equal(value, after[name], equal_nan=not isinstance(value, bytes)), name
 
 
-class TestSignatures:
-    def test_pymavlink_believes_them(self) -> None:
-        signer = Signer(KEY)
-        first = signer.sign(frame_of("ATTITUDE", time_boot_ms=3, roll=0.5), NOW_US)
-        message = decoded(first, KEY)
-        assert (message.time_boot_ms, message.roll) == (3, 0.5)
-        assert not unsigned(first)
-        assert signer.signed == 1
-
-    def test_another_key_is_refused(self) -> None:
-        frame = Signer(KEY).sign(frame_of("ATTITUDE"), NOW_US)
-        reader = common.MAVLink(None)
-        reader.signing.secret_key = KEY[::-1]
-        with pytest.raises(common.MAVError, match="signature"):
-            reader.parse_char(frame)
-
-    def test_time_never_stands_still_nor_goes_back(self) -> None:
-        signer = Signer(KEY)
-        stamps = [
-            int.from_bytes(signer.sign(frame_of("ATTITUDE"), now_us)[-12:-6], "little")
-            for now_us in (NOW_US, NOW_US, NOW_US - 10**9, NOW_US + 50)
-        ]
-        assert stamps == sorted(set(stamps))
-        assert stamps[0] == (NOW_US - 1_420_070_400_000_000) // 10  # 10 us units since 2015
-
-    def test_an_old_signature_is_replaced(self) -> None:
-        old = Signer(KEY[::-1]).sign(frame_of("ATTITUDE", roll=0.5), NOW_US)
-        new = Signer(KEY).sign(old, NOW_US)
-        assert len(new) == len(old)
-        assert decoded(new, KEY).roll == 0.5
-
-    def test_moved_times_leave_no_signature_that_does_not_fit(self) -> None:
-        frame = Signer(KEY).sign(frame_of("ATTITUDE", time_boot_ms=5_000), NOW_US)
-        mover = TimeMover(log_of(frame), np.ones(1, dtype=np.bool_), NOW_US)
-        assert unsigned(mover.move(frame, 0))
-        assert not unsigned(Signer(KEY).sign(mover.move(frame, 0), NOW_US))
-
-    def test_what_cannot_be_signed_is_counted(self) -> None:
-        signer = Signer(KEY)
-        old = mavlink1_frame(common.MAVLink_attitude_message(7_000, 0.25, 0, 0, 0, 0, 0))
-        foreign = b"\xfd\x01\x00\x00\x09\x01\x01\xff\xff\xfe\x07\x11\x22"
-        assert signer.sign(old, NOW_US) == old
-        assert signer.sign(foreign, NOW_US) == foreign
-        assert (signer.signed, signer.unsigned) == (0, 2)
-
-    @pytest.mark.parametrize("content", [KEY, KEY.hex().encode(), KEY.hex().upper().encode() + b"\n"])
-    def test_a_key_is_digits_or_bytes(self, content: bytes, tmp_path: Path) -> None:
-        (tmp_path / "key").write_bytes(content)
-        assert read_key(tmp_path / "key") == KEY
-
-    @pytest.mark.parametrize("content", [b"", KEY[:-1], KEY.hex().encode()[:-1], b"passphrase"])
-    def test_anything_else_is_none(self, content: bytes, tmp_path: Path) -> None:
-        (tmp_path / "key").write_bytes(content)
-        with pytest.raises(UsageError, match="holds no signing key"):
-            read_key(tmp_path / "key")
-
-    def test_nor_is_a_file_that_is_not_there(self, tmp_path: Path) -> None:
-        with pytest.raises(UsageError, match="cannot read the signing key"):
-            read_key(tmp_path / "key")
+def test_moved_times_leave_no_signature_that_does_not_fit() -> None:
+    frame = Signatures(KEY).sign(frame_of("ATTITUDE", time_boot_ms=5_000), NOW_US)
+    mover = TimeMover(log_of(frame), np.ones(1, dtype=np.bool_), NOW_US)
+    assert unsigned(mover.move(frame, 0))
+    assert not unsigned(Signatures(KEY).sign(mover.move(frame, 0), NOW_US))

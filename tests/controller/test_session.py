@@ -8,7 +8,7 @@ import pytest
 
 from bridge.endpoint import Endpoint
 from bridge.links.memory import memory_pair
-from controller.vehicle import Vehicle
+from controller.session import HilSession
 from protocol.errors import ScenarioMismatchError
 from protocol.wire import mapping
 from protocol.wire.codec import Frame, FrameReader, FrameWriter, Layout
@@ -29,48 +29,48 @@ def request(param1: float, *, target: tuple[int, int] = (1, 1), command: int = A
     return frame(255, 190, mapping.COMMAND_LONG, payload)
 
 
-def vehicle(*, arm: bool = False, agreed: bool = True) -> Vehicle:
+def session(*, arm: bool = False, agreed: bool = True) -> HilSession:
     near, _ = memory_pair()
-    made = Vehicle(Endpoint(near, 1, 1), DIGEST, 191, arm=arm)
+    made = HilSession(Endpoint(near, 1, 1), DIGEST, (1, 191), arm=arm)
     if agreed:
-        made.take(frame(1, 191, mapping.VERSION, mapping.encode_version(DIGEST)))
+        made.hear(frame(1, 191, mapping.VERSION, mapping.encode_version(DIGEST)))
     return made
 
 
 def test_it_starts_disarmed_and_arms_by_itself_only_when_told_to() -> None:
-    assert not vehicle(arm=True, agreed=False).armed
-    assert vehicle(arm=True).armed
-    assert not vehicle(arm=False).armed
+    assert not session(arm=True, agreed=False).armed
+    assert session(arm=True).armed
+    assert not session(arm=False).armed
 
 
 def test_a_station_arms_and_disarms_it() -> None:
-    made = vehicle()
-    made.take(request(1.0))
+    made = session()
+    made.hear(request(1.0))
     assert made.armed
-    made.take(request(0.0))
+    made.hear(request(0.0))
     assert not made.armed
 
 
 @pytest.mark.parametrize("param1", [math.nan, 0.5, -1.0])
 def test_what_asks_for_neither_changes_nothing(param1: float) -> None:
-    made = vehicle(arm=True)
-    made.take(request(param1))
+    made = session(arm=True)
+    made.hear(request(param1))
     assert made.armed
 
 
 def test_requests_to_others_and_other_commands_change_nothing() -> None:
-    made = vehicle()
+    made = session()
     for one in (request(1.0, target=(2, 1)), request(1.0, target=(1, 2)), request(1.0, command=511)):
-        made.take(one)
+        made.hear(one)
     assert not made.armed
 
 
 def test_it_does_not_arm_before_the_emulator_has_shown_the_same_scenario() -> None:
-    made = vehicle(agreed=False)
-    made.take(request(1.0))
+    made = session(agreed=False)
+    made.hear(request(1.0))
     assert not made.armed
 
 
 def test_another_scenario_is_refused() -> None:
     with pytest.raises(ScenarioMismatchError):
-        vehicle().take(frame(1, 191, mapping.VERSION, mapping.encode_version(b"87654321")))
+        session().hear(frame(1, 191, mapping.VERSION, mapping.encode_version(b"87654321")))

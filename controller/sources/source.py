@@ -1,0 +1,53 @@
+"""Where pose samples come from: what every source does, whatever it speaks.
+
+A source takes what its link delivers, frame by frame in the order on the wire, and stops at each new sample, so that what
+came before it is heard before it is answered. It reads positions and attitude angles, and no velocity.
+"""
+
+from __future__ import annotations
+
+import abc
+import enum
+
+from protocol.messages import FloatArray
+from protocol.wire.codec import Frame
+
+
+class Found(enum.IntEnum):
+    """Why a source stopped reading."""
+
+    NOTHING = 0
+    """all that was given has been read"""
+    SAMPLE = 1
+    """a new sample is there"""
+    AGAIN = 2
+    """the newest sample came once more: its answer was lost"""
+    OTHERS = 3
+    """frames that are not the source's are to be heard before it reads on"""
+
+
+class PoseSource(abc.ABC):
+    """Turns what a link delivers into pose samples.
+
+    t_ns      time of the newest sample; -1 before the first
+    q         (6,) its position (m, north east down) and attitude (rad); the next sample overwrites it
+    others    frames met since `read` began, or since they were last taken: somebody else hears them
+    """
+
+    t_ns: int = -1
+    q: FloatArray
+
+    def __init__(self) -> None:
+        self.others: list[Frame] = []
+
+    @abc.abstractmethod
+    def feed(self, data: bytes) -> None:
+        """Take the next bytes of the link: a datagram, or a chunk of a stream."""
+
+    @abc.abstractmethod
+    def read(self) -> Found:
+        """Read on in what was fed, up to the next sample."""
+
+    @abc.abstractmethod
+    def counters(self) -> dict[str, int]:
+        """What was refused, by cause."""

@@ -1,0 +1,156 @@
+"""Commands from the controller: HIL_ACTUATOR_CONTROLS, held against the ticks that they may answer, in compiled code."""
+
+from __future__ import annotations
+
+import enum
+
+import numpy as np
+
+from protocol.compiled import Packed, compiled, pack
+from protocol.messages import FloatArray
+from protocol.wire.codec import Frame, FrameReader, frame_of
+from protocol.wire.framing import Bytes, Table, next_frame, take_payload
+from protocol.wire.mapping import ARMED, COMMAND, read_command
+
+
+class Found(enum.IntEnum):
+    """Why the reading stopped."""
+
+    NOTHING = 0
+    """all that was given has been read"""
+    COMMAND = 1
+    """a command that may act is there"""
+    OTHERS = 2
+    """other frames are to be heard before it reads on"""
+
+
+CAUSES = ("refused_commands", "old_commands", "repeated", "unknown_echoes")
+REFUSED, OLD, REPEATED, UNKNOWN_ECHO = range(len(CAUSES))
+NOTHING, COMMANDED, OTHERS = (int(found) for found in Found)
+_FOUND = tuple(Found)
+_COMMAND_ID = COMMAND.message_id
+_FRAMES_AT_ONCE = 64
+
+
+@compiled
+def receive(data: Bytes, at: int, reading: Packed, table: Table, rows: Packed, source: Packed) -> tuple[int, int, int]:
+    """Read frames from `at` on, up to the next command that may act: (why it stopped, where, frames read into `rows`)."""
+    s, r = source[0], reading[0]
+    counters = s.counters
+    count = 0
+    while count < len(rows):
+        end = next_frame(data, at, r, table, rows[count])
+        if end < 0:
+            return NOTHING, len(data), count
+        at = end
+        row = rows[count]
+        count += 1
+        if row.message_id != _COMMAND_ID or row.system != s.system or row.component != s.component:
+            continue
+        take_payload(data, row, s.command_bytes)
+        echo_us = np.int64(s.command.time_usec)
+        if not read_command(s.command, s.scale, s.tau):
+            counters[REFUSED] += 1
+        elif echo_us == s.newest_us:
+            counters[REPEATED] += 1
+        elif 0 <= echo_us < max(s.oldest_us, s.newest_us):
+            counters[OLD] += 1
+        elif echo_us < 0 or echo_us > s.latest_us or echo_us % s.period_us:
+            counters[UNKNOWN_ECHO] += 1
+        else:
+            if s.newest_us < 0:  # the controller's numbers restart with its first answer
+                r.follow = 1
+                r.next[:] = -1
+                r.next[row.system << 8 | row.component] = (row.sequence + 1) & 0xFF
+            s.newest_us = echo_us
+            s.armed = s.command.mode & ARMED != 0
+            s.newest[:] = s.tau
+            return COMMANDED, at, count
+    return OTHERS, at, count
+
+
+class CommandSource:
+    """Reads what the loop's link delivers; only commands of the controller at `sender` are believed.
+
+    newest      (6,) the newest command that may act, as it came              armed    whether it may act at all
+    others      frames that are no commands, since they were last taken: somebody else hears them
+    raws        every intact frame since they were last taken, as it was on the wire: for the log
+
+    counters    refused_commands  commands with a control that is not a number
+                old_commands      commands that answer a tick before the oldest that may still be answered
+                repeated          commands that came again: they stand, and do not count as fresh
+                unknown_echoes    commands that answer no tick that was sent
+    """
+
+    def __init__(self, reader: FrameReader, sender: tuple[int, int], scale: FloatArray, period_ns: int) -> None:
+        self.others: list[Frame] = []
+        self.raws: list[bytes] = []
+        self._sender = sender
+        self._reader = reader
+        self._rows = np.zeros(_FRAMES_AT_ONCE, dtype=reader.rows.dtype)
+        self._memory = pack(
+            {
+                "system": sender[0],
+                "component": sender[1],
+                "scale": scale,
+                "tau": np.zeros(6),
+                "newest": np.zeros(6),
+                "armed": 0,
+                "newest_us": -1,
+                "oldest_us": 0,
+                "latest_us": 0,
+                "period_us": period_ns // 1000,
+                "counters": np.zeros(len(CAUSES), dtype=np.int64),
+            },
+            {"command": COMMAND.dtype},
+        )
+        self._arguments = (reader.reading, reader.table, self._rows, self._memory)
+        self._oldest_us, self._latest_us = self._memory["oldest_us"], self._memory["latest_us"]
+        self._data = b""
+        self._at = 0
+        self.newest: FloatArray = self._memory["newest"][0]
+
+    @property
+    def armed(self) -> bool:
+        """Whether the newest command may act at all."""
+        return bool(self._memory["armed"][0])
+
+    @property
+    def newest_ns(self) -> int:
+        """Time of the sample that the newest command answers, ns; negative before the first."""
+        return int(self._memory["newest_us"][0]) * 1000
+
+    def expect(self, oldest_ns: int, latest_ns: int) -> None:
+        """From now on a command may answer the ticks from oldest_ns to latest_ns, if it is newer than the newest."""
+        self._oldest_us[0], self._latest_us[0] = oldest_ns // 1000, latest_ns // 1000
+
+    def feed(self, data: bytes) -> None:
+        """Take the next bytes of the link."""
+        self._data, self._at = self._reader.whole(data), 0
+
+    def read(self) -> Found:
+        """Read on, up to the next command that may act; see `receive`."""
+        data, begun = self._data, self._at
+        if begun == len(data):
+            return Found.NOTHING
+        found, self._at, count = receive(data, begun, *self._arguments)
+        if count == 1 and found == COMMANDED and not begun and self._at == len(data):
+            self.raws.append(data)  # as nearly always
+        elif count:
+            frames = [frame_of(data, row) for row in self._rows[:count].tolist()]
+            self.raws += [frame.raw for frame in frames]
+            self.others += [
+                one for one in frames if one.message_id != _COMMAND_ID or (one.system, one.component) != self._sender
+            ]
+        if found == NOTHING:
+            self._reader.keep_rest(data)
+        return _FOUND[found]
+
+    @property
+    def strays(self) -> int:
+        """How many commands were refused, whatever the cause."""
+        return int(self._memory["counters"][0].sum())
+
+    def counters(self) -> dict[str, int]:
+        """What was refused, by cause."""
+        return dict(zip(CAUSES, self._memory["counters"][0].tolist(), strict=True))

@@ -1,0 +1,25 @@
+"""When something periodic is due."""
+
+from __future__ import annotations
+
+NANOSECONDS = 1_000_000_000
+NEVER = 1 << 62
+"""A time in ns that does not come."""
+
+
+class Due:
+    """Says when something periodic is due, in the time it is asked with: first at once, then each period.
+
+    next_ns   until then it is not due
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_ns = max(1, round(NANOSECONDS / rate_hz))
+        self.next_ns = 0
+
+    def at(self, t_ns: int) -> bool:
+        """Whether it is due at `t_ns`; asking so also marks it as done."""
+        if t_ns < self.next_ns:
+            return False
+        self.next_ns = (t_ns // self._period_ns + 1) * self._period_ns
+        return True
