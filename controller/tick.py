@@ -20,6 +20,9 @@ from protocol.wire.codec import Frame, FrameWriter
 from protocol.wire.schedule import Encoder, Saying
 
 
+_SAMPLE, _AGAIN = Found.SAMPLE, Found.AGAIN
+
+
 class Session(Protocol):
     """What a tick needs to know of whoever the controller works with."""
 
@@ -75,14 +78,14 @@ class Tick:
                 others, source.others = source.others, []
                 for frame in others:
                     self.session.hear(frame)
-            if found == Found.SAMPLE:
+            if found is _SAMPLE:
                 self.counters["skipped_samples"] += self.is_fresh
                 self.is_fresh = True
                 if self.at_once:
                     self.answer()
-            elif found == Found.AGAIN and self.at_once:
+            elif found is _AGAIN and self.at_once:
                 self.repeat()
-            elif found == Found.NOTHING:
+            if source.is_read:
                 return
 
     def answer(self) -> None:

@@ -33,15 +33,21 @@ _FRAMES_AT_ONCE = 64
 
 
 @compiled
-def receive(data: Bytes, at: int, reading: Packed, table: Table, rows: Packed, source: Packed) -> tuple[int, int, int]:
-    """Read frames from `at` on, up to the next command that may act: (why it stopped, where, frames read into `rows`)."""
+def receive(
+    data: Bytes, at: int, reading: Packed, table: Table, rows: Packed, source: Packed, oldest_us: int, latest_us: int
+) -> tuple[int, int, int, int, bool]:
+    """Read frames from `at` on, up to the next command that may act.
+
+    Returns why it stopped, where, how many frames it has read into `rows`, and of the newest command that may act the time
+    of the tick that it answers (us) and whether it is armed.
+    """
     s, r = source[0], reading[0]
     counters = s.counters
     count = 0
     while count < len(rows):
         end = next_frame(data, at, r, table, rows[count])
         if end < 0:
-            return NOTHING, len(data), count
+            return NOTHING, len(data), count, s.newest_us, s.armed != 0
         at = end
         row = rows[count]
         count += 1
@@ -53,9 +59,9 @@ def receive(data: Bytes, at: int, reading: Packed, table: Table, rows: Packed, s
             counters[REFUSED] += 1
         elif echo_us == s.newest_us:
             counters[REPEATED] += 1
-        elif 0 <= echo_us < max(s.oldest_us, s.newest_us):
+        elif 0 <= echo_us < max(oldest_us, s.newest_us):
             counters[OLD] += 1
-        elif echo_us < 0 or echo_us > s.latest_us or echo_us % s.period_us:
+        elif echo_us < 0 or echo_us > latest_us or echo_us % s.period_us:
             counters[UNKNOWN_ECHO] += 1
         else:
             if s.newest_us < 0:  # the controller's numbers restart with its first answer
@@ -65,14 +71,16 @@ def receive(data: Bytes, at: int, reading: Packed, table: Table, rows: Packed, s
             s.newest_us = echo_us
             s.armed = s.command.mode & ARMED != 0
             s.newest[:] = s.tau
-            return COMMANDED, at, count
-    return OTHERS, at, count
+            return COMMANDED, at, count, int(echo_us), bool(s.armed != 0)
+    return OTHERS, at, count, s.newest_us, s.armed != 0
 
 
 class CommandSource:
     """Reads what the loop's link delivers; only commands of the controller at `sender` are believed.
 
-    newest      (6,) the newest command that may act, as it came              armed    whether it may act at all
+    newest      (6,) the newest command that may act, as it came
+    newest_ns   time of the tick that it answers; negative before the first     armed   whether it may act at all
+    is_read     whether all that was fed has been read
     others      frames that are no commands, since they were last taken: somebody else hears them
     raws        every intact frame since they were last taken, as it was on the wire: for the log
 
@@ -83,6 +91,7 @@ class CommandSource:
     """
 
     def __init__(self, reader: FrameReader, sender: tuple[int, int], scale: FloatArray, period_ns: int) -> None:
+        self.newest_ns, self.armed, self.is_read = -1, False, True
         self.others: list[Frame] = []
         self.raws: list[bytes] = []
         self._sender = sender
@@ -97,32 +106,20 @@ class CommandSource:
                 "newest": np.zeros(6),
                 "armed": 0,
                 "newest_us": -1,
-                "oldest_us": 0,
-                "latest_us": 0,
                 "period_us": period_ns // 1000,
                 "counters": np.zeros(len(CAUSES), dtype=np.int64),
             },
             {"command": COMMAND.dtype},
         )
         self._arguments = (reader.reading, reader.table, self._rows, self._memory)
-        self._oldest_us, self._latest_us = self._memory["oldest_us"], self._memory["latest_us"]
+        self._oldest_us = self._latest_us = 0
         self._data = b""
         self._at = 0
         self.newest: FloatArray = self._memory["newest"][0]
 
-    @property
-    def armed(self) -> bool:
-        """Whether the newest command may act at all."""
-        return bool(self._memory["armed"][0])
-
-    @property
-    def newest_ns(self) -> int:
-        """Time of the sample that the newest command answers, ns; negative before the first."""
-        return int(self._memory["newest_us"][0]) * 1000
-
     def expect(self, oldest_ns: int, latest_ns: int) -> None:
         """From now on a command may answer the ticks from oldest_ns to latest_ns, if it is newer than the newest."""
-        self._oldest_us[0], self._latest_us[0] = oldest_ns // 1000, latest_ns // 1000
+        self._oldest_us, self._latest_us = oldest_ns // 1000, latest_ns // 1000
 
     def feed(self, data: bytes) -> None:
         """Take the next bytes of the link."""
@@ -131,12 +128,15 @@ class CommandSource:
     def read(self) -> Found:
         """Read on, up to the next command that may act; see `receive`."""
         data, begun = self._data, self._at
-        if begun == len(data):
-            return Found.NOTHING
-        found, self._at, count = receive(data, begun, *self._arguments)
-        if count == 1 and found == COMMANDED and not begun and self._at == len(data):
+        found, self._at, count, newest_us, self.armed = receive(
+            data, begun, *self._arguments, self._oldest_us, self._latest_us
+        )
+        self.newest_ns = newest_us * 1000
+        self.is_read = self._at == len(data)
+        if count == 1 and found == COMMANDED and not begun and self.is_read:
             self.raws.append(data)  # as nearly always
-        elif count:
+            return Found.COMMAND
+        if count:
             frames = [frame_of(data, row) for row in self._rows[:count].tolist()]
             self.raws += [frame.raw for frame in frames]
             self.others += [

@@ -114,15 +114,15 @@ class HilSource(PoseSource):
 
     def read(self) -> Found:
         """Read on, up to the next sample; see `receive`."""
-        if self._at == len(self._data):
-            return Found.NOTHING
-        found, self._at, others = receive(self._data, self._at, *self._arguments)
+        data = self._data
+        found, self._at, others = receive(data, self._at, *self._arguments)
+        self.is_read = self._at == len(data)
         if others:
-            self.others += [frame_of(self._data, row) for row in self._rows[:others].tolist()]
+            self.others += [frame_of(data, row) for row in self._rows[:others].tolist()]
         if found == SAMPLE:
             self.t_ns = self._newest_us.item() * 1000
         elif found == NOTHING:
-            self._reader.keep_rest(self._data)
+            self._reader.keep_rest(data)
         return _FOUND[found]
 
     def counters(self) -> dict[str, int]:

@@ -31,6 +31,7 @@ class PoseSource(abc.ABC):
 
     t_ns      time of the newest sample; -1 before the first
     q         (6,) its position (m, north east down) and attitude (rad); the next sample overwrites it
+    is_read   whether all that was fed has been read
     others    frames met since `read` began, or since they were last taken: somebody else hears them
     """
 
@@ -38,6 +39,7 @@ class PoseSource(abc.ABC):
     q: FloatArray
 
     def __init__(self) -> None:
+        self.is_read = True
         self.others: list[Frame] = []
 
     @abc.abstractmethod

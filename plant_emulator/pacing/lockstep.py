@@ -28,6 +28,7 @@ class Lockstep(Pacing):
         self.delay_ns = delay_ns
         self.keeper = keeper
         self.sends_ahead = keeper is None
+        self._strays = 0
         self.counters = {"resent": 0, "foreign": 0}
 
     def begin(self, t_ns: int) -> None:
@@ -66,13 +67,13 @@ class Lockstep(Pacing):
             data = self.endpoint.link.recv(timeout_s)
             came_ns = clock.now_ns()
             if data:
-                strays = source.strays
                 self.take(data, t_ns)
                 if source.newest_ns == t_ns:
                     self.latencies_ns.append(came_ns - self.sent_ns)
                     self.log_answer(t_ns)
                     return True
-                if source.strays > strays:
+                if source.strays > self._strays:
+                    self._strays = source.strays
                     self.forget_received()
             remaining_ns = deadline_ns - came_ns
             if (timeout_s == 0.0 and not data) or remaining_ns < -wait_ns:

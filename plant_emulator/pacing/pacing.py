@@ -16,6 +16,9 @@ from protocol.logs.tlog import TlogWriter
 from protocol.wire.codec import Frame
 
 
+_COMMAND = Found.COMMAND
+
+
 class Parts(NamedTuple):
     """What a pacing brings together, whichever it is; period_ns: from tick to tick, ticks: how many there are."""
 
@@ -105,9 +108,9 @@ class Pacing(abc.ABC):
             if source.others:
                 others, source.others = source.others, []
                 self.hear(others)
-            if found == Found.COMMAND:
+            if found is _COMMAND:
                 self.command_came(t_ns)
-            elif found == Found.NOTHING:
+            if source.is_read:
                 return
 
     def note_received(self) -> None:  # noqa: B027  (lockstep logs an answer when it is whole)
