@@ -13,7 +13,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from controller.laws.registry import LAWS
+from controller.laws.registry import LAWS, law_entry
 from protocol.errors import FwavHilError
 from protocol.scenario import Scenario, with_overrides
 from protocol.wire.codec import Layout
@@ -57,7 +57,12 @@ GROUPS = (
     Group("LAW_ROTATE", "control", "rotate_force", "1: the force is rotated into the body", Kind.INT32, False, True),
     Group("LAW_ORDER", "control", "order", "order of the filter G_f", Kind.INT32, False),
     Group(
-        "LAW_INDEX", "", "law", f"the law: {', '.join(f'{i} {name}' for i, name in enumerate(LAWS))}", Kind.INT32, False
+        "LAW_INDEX",
+        "",
+        "law",
+        f"the law: {', '.join(f'{entry.number} {name}' for name, entry in LAWS.items())}",
+        Kind.INT32,
+        False,
     ),
     Group("LAW_RATE_HZ", "", "rate_hz", "rate of the law, Hz", Kind.REAL32, False),
     Group("ACT_SCALE", "actuators", "scale", "what a control of 1 stands for, N, N m"),
@@ -86,7 +91,7 @@ def value_of(scenario: Scenario, parameter: Parameter) -> float:
     """A parameter's value, exactly as the scenario has it."""
     value = getattr(getattr(scenario, parameter.table) if parameter.table else scenario, parameter.field)
     if parameter.field == "law":
-        return float(list(LAWS).index(value))
+        return float(law_entry(value).number)
     return float(value if parameter.axis is None else value[parameter.axis])
 
 

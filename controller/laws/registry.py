@@ -15,8 +15,14 @@ if TYPE_CHECKING:
 
 
 class LawEntry(NamedTuple):
-    """Where a law is built (module:function), whether it needs velocities, and what it is in a few words."""
+    """What is known of a law without loading it.
 
+    number          what logs know it by (LAW_INDEX): it never changes, and goes to no other law
+    place           module:function that builds it
+    needs_velocity  state feedback: it flies in `simulate` only
+    """
+
+    number: int
     place: str
     needs_velocity: bool
     summary: str
@@ -24,20 +30,21 @@ class LawEntry(NamedTuple):
 
 LAWS: Mapping[str, LawEntry] = MappingProxyType(
     {
-        "ude": LawEntry("controller.laws.ude:ude", False, "the paper's output feedback with the estimator (21)"),
+        "ude": LawEntry(0, "controller.laws.ude:ude", False, "the paper's output feedback with the estimator (21)"),
         "ude_state": LawEntry(
-            "controller.laws.ude:ude_state", True, "the paper's state feedback (20); in `simulate` only"
+            1, "controller.laws.ude:ude_state", True, "the paper's state feedback (20); in `simulate` only"
         ),
-        "pd": LawEntry("controller.laws.pd:pd", False, "PD"),
-        "dob": LawEntry("controller.laws.dob:dob", False, "PD and a disturbance observer"),
+        "pd": LawEntry(2, "controller.laws.pd:pd", False, "PD"),
+        "dob": LawEntry(3, "controller.laws.dob:dob", False, "PD and a disturbance observer"),
         "dob_ff": LawEntry(
-            "controller.laws.dob:dob_ff", False, "the same with feed-forward of the reference's acceleration"
+            4, "controller.laws.dob:dob_ff", False, "the same with feed-forward of the reference's acceleration"
         ),
         "uncompensated": LawEntry(
-            "controller.laws.ude:uncompensated", False, "the UDE law without its estimate (G_f = 0)"
+            5, "controller.laws.ude:uncompensated", False, "the UDE law without its estimate (G_f = 0)"
         ),
     }
 )
+"""A new law takes the next number; one that is taken out leaves its own unused."""
 
 
 def law_entry(name: str) -> LawEntry:

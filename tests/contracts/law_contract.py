@@ -1,4 +1,4 @@
-"""LawContract: what every control law must do. Inherit it as `class TestMyLaw(LawContract)` and give its `name`."""
+"""LawContract: what every control law must do. Inherit it as `class TestMyLaw(LawContract)`: its `name` and `number`."""
 
 from __future__ import annotations
 
@@ -66,9 +66,13 @@ def wild_samples(period_ns: int, seed: int, count: int = 60) -> list[Sample]:
 
 
 class LawContract:
-    """The tests; `name` is the law's in the registry. Samples are those of a quiet flight with that very law."""
+    """The tests; `name` is the law's in the registry, `number` the one that logs know it by, for ever.
+
+    Samples are those of a quiet flight with that very law.
+    """
 
     name: ClassVar[str]
+    number: ClassVar[int]
 
     @pytest.fixture
     def scenario(self) -> Scenario:
@@ -199,3 +203,6 @@ class LawContract:
         assert law.name == self.name
         assert law.period_ns == scenario.period_ns
         assert law.needs_velocity == LAWS[self.name].needs_velocity
+
+    def test_a_law_keeps_its_number(self) -> None:
+        assert LAWS[self.name].number == self.number

@@ -76,7 +76,13 @@ def test_values_are_the_scenarios() -> None:
     assert values["ACT_LOWER_Z"] == -0.12
     assert values["HYS_CHI_ROLL"] == FLAPPER.hysteresis.chi[3]  # type: ignore[union-attr]
     assert "HYS_B_X" not in values
-    assert list(LAWS)[int(values["LAW_INDEX"])] == "ude"
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_log_knows_the_law_by_its_number(law: str) -> None:
+    scenario = scenario_of("flapper", law=law)
+    (index,) = [parameter for parameter in parameters_of(scenario) if parameter.name == "LAW_INDEX"]
+    assert value_of(scenario, index) == LAWS[law].number
 
 
 def test_the_documented_table_is_the_one_of_the_code() -> None:

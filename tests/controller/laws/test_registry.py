@@ -16,27 +16,27 @@ from tests.contracts.law_contract import LawContract
 
 
 class TestUde(LawContract):
-    name = "ude"
+    name, number = "ude", 0
 
 
 class TestUdeState(LawContract):
-    name = "ude_state"
+    name, number = "ude_state", 1
 
 
 class TestPd(LawContract):
-    name = "pd"
+    name, number = "pd", 2
 
 
 class TestDob(LawContract):
-    name = "dob"
+    name, number = "dob", 3
 
 
 class TestDobFeedForward(LawContract):
-    name = "dob_ff"
+    name, number = "dob_ff", 4
 
 
 class TestUncompensated(LawContract):
-    name = "uncompensated"
+    name, number = "uncompensated", 5
 
 
 def test_every_law_has_its_contract_tested() -> None:
@@ -60,6 +60,10 @@ def test_every_law_says_what_it_is() -> None:
     summaries = [entry.summary for entry in LAWS.values()]
     assert all(summaries)
     assert len(set(summaries)) == len(summaries)
+
+
+def test_no_two_laws_have_one_number() -> None:
+    assert len({entry.number for entry in LAWS.values()}) == len(LAWS)
 
 
 @pytest.mark.parametrize("name", LAWS)
