@@ -42,7 +42,7 @@ seed_option = click.option("--seed", type=click.IntRange(min=0), help="Seed of t
 law_option = click.option(
     "--law",
     metavar="LAW",
-    help="Law instead of the scenario's: ude, pd, dob, dob_ff, uncompensated; ude_state in `simulate`.",
+    help="Law instead of the scenario's, such as ude, pd or dob; an unknown name is answered with the list of all.",
 )
 clock_option = click.option(
     "--clock", type=click.Choice(["lockstep", "realtime"]), default="lockstep", show_default=True,

@@ -29,6 +29,8 @@ from bridge.command_line import (
 )
 from bridge.summary import show_json
 from bridge.timing.realtime import check_real_time, own_core
+from controller.laws.registry import refuse_on_a_link
+from protocol.scenario import find_scenario
 
 EXAMPLE = """
 \b
@@ -89,6 +91,7 @@ def controller(
     check_real_time(clock, realtime=realtime, trigger=trigger)
     if clock == "realtime":
         refuse_rate_that_cannot_fit(link, chosen.rate_hz)
+    refuse_on_a_link(chosen, find_scenario(scenario))
     report, stop = begin_process(status, core, with_parent=with_parent)
     from controller.options import ControllerOptions
     from controller.process import run_controller

@@ -1,21 +1,25 @@
 """The scenario's numbers as MAVLink parameters: gains, which may be set while disarmed; scales, limits and gears, to be read.
 
-A name is PREFIX_SYMBOL_AXIS, 16 characters at most; `markdown_table` prints the table of docs/station.md. Values travel as
-float32; a set that asks for what is there already (to float32) changes nothing, so that a gain keeps its every digit.
+A name is PREFIX_SYMBOL_AXIS, 16 characters at most; a law's file names its own gains (`controller.laws.gains`). `python -m
+controller.parameters` prints the table of docs/station.md with the gains of every law. Values travel as float32; a set that
+asks for what is there already (to float32) changes nothing, so that a gain keeps its every digit.
 """
 
 from __future__ import annotations
 
+import functools
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from typing import NamedTuple
+import typing
+from collections.abc import Callable, Collection, Iterator
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
-from controller.laws.registry import LAWS, law_entry
+from controller.laws.gains import LinkParameter
+from controller.laws.registry import LAWS, declared_gains, gains_tables, law_entry, load
 from protocol.errors import FwavHilError
-from protocol.scenario import Scenario, with_overrides
+from protocol.scenario import Scenario, Table, replace_gains, with_overrides
 from protocol.wire.codec import Layout
 from protocol.wire.parameter_mapping import VALUE, Kind, Refusal, encode_value
 
@@ -23,7 +27,10 @@ AXIS_NAMES = ("X", "Y", "Z", "ROLL", "PITCH", "YAW")
 
 
 class Parameter(NamedTuple):
-    """One parameter: its name, its place in the scenario (axis None: no field of six), what it is."""
+    """One parameter: its name, its place in the scenario (axis None: no field of six), what it is.
+
+    table: "" is the scenario itself; `gains.NAME` one of the gains of a law.
+    """
 
     name: str
     kind: Kind
@@ -45,25 +52,11 @@ class Group(NamedTuple):
     settable: bool = False
 
 
-GROUPS = (
-    Group("LAW_K", "control", "K", "gain K (13)", settable=True),
-    Group("LAW_LAMBDA", "control", "Lambda", "gain Lambda (11)", settable=True),
+_GROUPS = (
     Group("LAW_B", "control", "b", "assumed input gain over mass or inertia b (15)", settable=True),
-    Group("LAW_T", "control", "T", "time of the filter G_f, s", settable=True),
-    Group("LAW_N", "control", "N", "pole of the derivative, rad/s", settable=True),
-    Group("LAW_KP", "control", "Kp", "gain of PD and DOB", settable=True),
-    Group("LAW_KD", "control", "Kd", "gain of PD and DOB", settable=True),
     Group("LAW_UHAT0", "control", "uhat0", "estimate at the start, m/s^2, rad/s^2", settable=True),
     Group("LAW_ROTATE", "control", "rotate_force", "1: the force is rotated into the body", Kind.INT32, False, True),
-    Group("LAW_ORDER", "control", "order", "order of the filter G_f", Kind.INT32, False),
-    Group(
-        "LAW_INDEX",
-        "",
-        "law",
-        f"the law: {', '.join(f'{entry.number} {name}' for name, entry in LAWS.items())}",
-        Kind.INT32,
-        False,
-    ),
+    Group("LAW_INDEX", "", "law", "number of the law", Kind.INT32, False),
     Group("LAW_RATE_HZ", "", "rate_hz", "rate of the law, Hz", Kind.REAL32, False),
     Group("ACT_SCALE", "actuators", "scale", "what a control of 1 stands for, N, N m"),
     Group("ACT_LOWER", "actuators", "lower", "least command, N, N m"),
@@ -74,12 +67,44 @@ GROUPS = (
     Group("HYS_B", "hysteresis", "B", "half width of the play (2), N, N m"),
 )
 
+_FIRST = tuple(f"LAW_{name}" for name in ("K", "LAMBDA", "B", "T", "N", "KP", "KD", "UHAT0", "ROTATE", "ORDER"))
+"""Order of the indices: these first, as in the logs there are, then the other groups above, then the gains of later laws."""
+
+
+@functools.cache
+def _gains_groups(table: str, declared: type[Table]) -> tuple[Group, ...]:
+    """The groups of a law's table of gains, as its struct declares them."""
+    groups = []
+    for field, hint in typing.get_type_hints(declared, include_extras=True).items():
+        for said in getattr(hint, "__metadata__", ()):
+            if isinstance(said, LinkParameter):
+                kind = Kind.INT32 if hint.__origin__ in (int, bool) else Kind.REAL32
+                per_axis = typing.get_origin(hint.__origin__) is tuple
+                groups.append(Group(said.prefix, f"gains.{table}", field, said.meaning, kind, per_axis, said.settable))
+    return tuple(groups)
+
+
+def _groups(gains: dict[str, type[Table]]) -> list[Group]:
+    """All groups with these tables of gains, in the order of their indices."""
+    groups = [*_GROUPS, *(group for table in gains.items() for group in _gains_groups(*table))]
+    return sorted(groups, key=lambda group: _FIRST.index(group.prefix) if group.prefix in _FIRST else len(_FIRST))
+
+
+def _table(scenario: Scenario, name: str) -> Any:
+    if name.startswith("gains."):
+        table = name.removeprefix("gains.")
+        return scenario.read_gains(table, declared_gains(scenario)[table])
+    return getattr(scenario, name) if name else scenario
+
 
 def parameters_of(scenario: Scenario) -> tuple[Parameter, ...]:
-    """The scenario's parameters, in the order of their indices; of the gears those that its model has."""
+    """The scenario's parameters, in the order of their indices.
+
+    Of the gears those that its model has; of the laws' gains those of its law, and of each table that it has for others.
+    """
     found = []
-    for group in GROUPS:
-        if not hasattr(getattr(scenario, group.table) if group.table else scenario, group.field):
+    for group in _groups(declared_gains(scenario)):
+        if not hasattr(_table(scenario, group.table), group.field):
             continue
         for axis in range(len(AXIS_NAMES)) if group.per_axis else (None,):
             name = group.prefix if axis is None else f"{group.prefix}_{AXIS_NAMES[axis]}"
@@ -89,30 +114,39 @@ def parameters_of(scenario: Scenario) -> tuple[Parameter, ...]:
 
 def value_of(scenario: Scenario, parameter: Parameter) -> float:
     """A parameter's value, exactly as the scenario has it."""
-    value = getattr(getattr(scenario, parameter.table) if parameter.table else scenario, parameter.field)
+    value = getattr(_table(scenario, parameter.table), parameter.field)
     if parameter.field == "law":
         return float(law_entry(value).number)
     return float(value if parameter.axis is None else value[parameter.axis])
 
 
+def _like(old: object, value: float) -> float:
+    """A value off the link as the type that the scenario holds; what does not fit is left for the scenario to refuse."""
+    if isinstance(old, bool):
+        return bool(value) if value in (0.0, 1.0) else value
+    return int(value) if isinstance(old, int) and float(value).is_integer() else value
+
+
 def changed(scenario: Scenario, parameter: Parameter, value: float) -> Scenario:
     """The scenario with a settable parameter set to a value. Raises ScenarioError where that is out of range."""
-    table = msgspec.to_builtins(getattr(scenario, parameter.table))
-    if parameter.axis is None:
-        table[parameter.field] = bool(value)
-    else:
-        table[parameter.field] = [
-            value if axis == parameter.axis else old for axis, old in enumerate(table[parameter.field])
-        ]
-    return with_overrides(scenario, **{parameter.table: table})
+    table = msgspec.to_builtins(_table(scenario, parameter.table))
+    old = table[parameter.field]
+    new: Any = _like(old, value)
+    if parameter.axis is not None:
+        new = [value if axis == parameter.axis else held for axis, held in enumerate(old)]
+    if not parameter.table.startswith("gains."):
+        return with_overrides(scenario, **{parameter.table: {**table, parameter.field: new}})
+    other = replace_gains(scenario, parameter.table.removeprefix("gains."), **{parameter.field: new})
+    _table(other, parameter.table)  # as the law would read it
+    return other
 
 
-def followed(scenario: Scenario, said: Iterable[tuple[str, float | None]]) -> Scenario:
+def followed(scenario: Scenario, said: Collection[tuple[str, float | None]]) -> Scenario:
     """The scenario with the gains that (name, value) of a log's PARAM_VALUE say: only what differs, to float32, is changed.
 
     Raises ScenarioError where a value is none that could have been set.
     """
-    by_name = {parameter.name: parameter for parameter in parameters_of(scenario)}
+    by_name = {parameter.name: parameter for parameter in parameters_of(scenario)} if said else {}
     for name, value in said:
         parameter = by_name.get(name)
         if parameter is None or not parameter.settable or value is None:
@@ -162,8 +196,6 @@ class Parameters:
             return Refusal.READ_ONLY
         if armed:
             return Refusal.ARMED
-        if parameter.axis is None and value not in (0.0, 1.0):
-            return Refusal.OUT_OF_RANGE
         try:
             scenario = changed(self.scenario, parameter, value)
             self._apply(scenario)
@@ -174,15 +206,18 @@ class Parameters:
         return None
 
 
-def markdown_table() -> Iterator[str]:
-    """The lines of the table as it stands in docs/station.md."""
+def markdown_table(gains: dict[str, type[Table]]) -> Iterator[str]:
+    """The lines of the table in docs/station.md, with these tables of gains."""
     yield "| parameter | type | set | meaning |"
     yield "| --- | --- | --- | --- |"
-    for group in GROUPS:
+    for group in _groups(gains):
         name = f"{group.prefix}_X ... _YAW" if group.per_axis else group.prefix
         place = f"`{group.table}.{group.field}`" if group.table else f"`{group.field}`"
         yield f"| {name} | {group.kind.name} | {'disarmed' if group.settable else '-'} | {place}: {group.meaning} |"
 
 
 if __name__ == "__main__":
-    sys.stdout.writelines(line + "\n" for line in markdown_table())
+    sys.stdout.writelines(
+        line + "\n" for line in markdown_table({table: load(at) for table, at in gains_tables().items()})
+    )
+    sys.stdout.writelines(f"LAW_INDEX {entry.number}: {name}\n" for name, entry in LAWS.items())

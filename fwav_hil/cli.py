@@ -189,8 +189,9 @@ def run_command(
     from fwav_hil.run import MotorsOnCan, RunOptions, check_link, run
     from fwav_hil.run_folder import new_folder
     from protocol.errors import FwavHilError, UsageError
+    from protocol.scenario import find_scenario
 
-    refuse_on_a_link(chosen)
+    refuse_on_a_link(chosen, find_scenario(scenario))
     check_real_time(clock, realtime=realtime, trigger=trigger)
     check_speed(clock, speed, chosen.rate_hz)
     check_link(link)
@@ -253,11 +254,14 @@ def simulate_command(
 ) -> None:
     """Fly SCENARIO in this process: the same laws, plant, sampling, delays and noise, compiled, without a link."""
     chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
+    from controller.laws.registry import check_law
     from fwav_hil.run_folder import new_folder
     from fwav_hil.simulation_results import simulate_run, simulate_spread
     from fwav_hil.tables import print_spread, print_summary
     from protocol.errors import DivergenceError, UsageError
+    from protocol.scenario import find_scenario
 
+    check_law(chosen, find_scenario(scenario))
     if seeds and out:
         raise UsageError("--seeds flies many runs and keeps none: leave out --out, or fly one --seed at a time")
     if seeds:

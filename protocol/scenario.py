@@ -9,12 +9,13 @@ from __future__ import annotations
 import contextlib
 import difflib
 import hashlib
+import json
 import math
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 import msgspec
 import tomli_w
@@ -38,7 +39,7 @@ LONGEST_S = 4_000_000.0
 """The longest time in a scenario: 46 days; the wire counts milliseconds in 32 bits."""
 
 
-class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A table of a scenario file: frozen, and closed to keys it does not know."""
 
     def __post_init__(self) -> None:
@@ -55,7 +56,7 @@ def _floats(table: msgspec.Struct) -> Iterator[tuple[str, float]]:
                 yield field, item
 
 
-class Body(_Table, frozen=True):
+class Body(Table, frozen=True):
     """The rigid body of (1). Mass in kg; Ixx, Iyy, Izz in kg m^2; gravity in m/s^2."""
 
     mass: Positive
@@ -63,7 +64,7 @@ class Body(_Table, frozen=True):
     gravity: NotNegative
 
 
-class Initial(_Table, frozen=True):
+class Initial(Table, frozen=True):
     """State of the plant at t = 0, and the body command that acts until the first one arrives."""
 
     position: Vector3
@@ -73,7 +74,7 @@ class Initial(_Table, frozen=True):
     command: Vector6 = ZERO6
 
 
-class Backlash(_Table, frozen=True, tag_field="model", tag="backlash"):
+class Backlash(Table, frozen=True, tag_field="model", tag="backlash"):
     """Backlash-like hysteresis (3): slope h, slope kappa just after the start, chi per N and per N m."""
 
     h: Positive6
@@ -87,21 +88,21 @@ class Backlash(_Table, frozen=True, tag_field="model", tag="backlash"):
                 raise ValueError(f"kappa must be below h, and is not on axis {axis} ({kappa} >= {h})")
 
 
-class Play(_Table, frozen=True, tag_field="model", tag="play"):
+class Play(Table, frozen=True, tag_field="model", tag="play"):
     """The play operator (2): slope h, half width B in units of the command (N, N m)."""
 
     h: Positive6
     B: NotNegative6
 
 
-class Disturbance(_Table, frozen=True):
+class Disturbance(Table, frozen=True):
     """A body force and torque after the gears, amplitude * sin(frequency * t); N, N m, rad/s."""
 
     amplitude: Vector6
     frequency_rad_s: NotNegative
 
 
-class Actuators(_Table, frozen=True):
+class Actuators(Table, frozen=True):
     """Limits in the body frame (N, N m), the scale of each channel on the wire, and what a stale command turns into."""
 
     lower: Vector6
@@ -121,21 +122,21 @@ class Actuators(_Table, frozen=True):
                 raise ValueError(f"safe must lie within the limits, and does not on axis {axis} ({safe})")
 
 
-class Delay(_Table, frozen=True):
+class Delay(Table, frozen=True):
     """Delay from a sample to the action of its command: whole periods, and seconds."""
 
     samples: Annotated[int, Meta(ge=0, le=1000)] = 0
     seconds: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
 
 
-class Noise(_Table, frozen=True):
+class Noise(Table, frozen=True):
     """Standard deviation of the position (m) and of each attitude angle (rad) as measured."""
 
     position: NotNegative = 0.0
     attitude: NotNegative = 0.0
 
 
-class Reference(_Table, frozen=True):
+class Reference(Table, frozen=True):
     """Reference model (12), (31), its start, and the command c(t) = amplitude sin(frequency t + phase) of (32), (33)."""
 
     A_d: Positive6
@@ -147,22 +148,20 @@ class Reference(_Table, frozen=True):
     initial: Vector6 = ZERO6
 
 
-class Control(_Table, frozen=True):
-    """Numbers of the laws: K (13), Lambda (11), b (15), filter time T and order of G_f, derivative pole N; PD gains."""
+class Control(Table, frozen=True):
+    """What every law believes about the vehicle.
 
-    K: Positive6
-    Lambda: Positive6
+    b             input gain over mass or inertia (15), 1/kg, 1/(kg m^2)
+    uhat0         estimate of u_d at the start, m/s^2, rad/s^2
+    rotate_force  whether the force is rotated from the inertial frame into the body frame
+    """
+
     b: Positive6
-    T: Positive6
-    N: Positive6
-    Kp: NotNegative6
-    Kd: NotNegative6
-    order: Annotated[int, Meta(ge=1, le=6)] = 2
     uhat0: Vector6 = ZERO6
     rotate_force: bool = True
 
 
-class World(_Table, frozen=True):
+class World(Table, frozen=True):
     """Where the emulator says it is: for real autopilots, never for the laws. Field in gauss, temperature in Celsius."""
 
     latitude_deg: Annotated[float, Meta(ge=-90.0, le=90.0)] = 47.397742
@@ -172,13 +171,13 @@ class World(_Table, frozen=True):
     temperature_celsius: float = 15.0
 
 
-class Wire(_Table, frozen=True):
+class Wire(Table, frozen=True):
     """Who the emulator is on the link: its MAVLink component id."""
 
     emulator_component: Annotated[int, Meta(ge=2, le=255)] = 191
 
 
-class Motor(_Table, frozen=True):
+class Motor(Table, frozen=True):
     """The drives on a CAN bus, six alike; without one (`--motor direct`) nothing of this table is used.
 
     bitrate             of the bus, bit/s; the one that load and delay are reckoned with
@@ -230,8 +229,15 @@ class Motor(_Table, frozen=True):
             raise ValueError(f"lag_s must be 0, or at least one period of the torque loop ({1 / self.loop_hz:g} s)")
 
 
-class Scenario(_Table, frozen=True):
-    """A whole run. Times in s, rates in Hz; a period is kept in whole nanoseconds (`period_ns`)."""
+AnyTable = TypeVar("AnyTable", bound=Table)
+
+
+class Scenario(Table, frozen=True):
+    """A whole run. Times in s, rates in Hz; a period is kept in whole nanoseconds (`period_ns`).
+
+    gains: tables by name, as the file has them. Each law declares its own as a struct; `read_gains` checks them by it, when
+    a law is used and not before, because an emulator has no use for laws.
+    """
 
     name: Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9_\-]*$")]
     description: str
@@ -246,6 +252,7 @@ class Scenario(_Table, frozen=True):
     actuators: Actuators
     reference: Reference
     control: Control
+    gains: Mapping[str, Any] = {}
     delay: Delay = Delay()
     noise: Noise = Noise()
     disturbance: Disturbance = Disturbance(amplitude=ZERO6, frequency_rad_s=0.0)
@@ -310,10 +317,19 @@ class Scenario(_Table, frozen=True):
 
         return np.array((*start.position, *start.attitude, *start.velocity, *start.attitude_rate))
 
+    def read_gains(self, table: str, declared: type[AnyTable], source: object = None) -> AnyTable:
+        """The table [gains.TABLE] as the struct in which a law declares it; `source` names the file in errors.
+
+        Raises ScenarioError.
+        """
+        return _convert(self.gains.get(table, {}), declared, str(source or f"scenario {self.name}"), f"gains.{table}")
+
     def digest(self) -> bytes:
         """8 bytes that emulator and controller must share: of all but what a command line may choose for one end alone.
 
-        The drives are none of the controller's business: their table leaves no trace.
+        Every table of gains in the file counts, whichever law flies: the emulator's run folder keeps the file as what was
+        flown. A gain that the file leaves at its default does not count, nor do the drives, which are none of the
+        controller's business.
         """
         return self._digest(without_motor=True)
 
@@ -324,6 +340,7 @@ class Scenario(_Table, frozen=True):
     def _digest(self, *, without_motor: bool) -> bytes:
         common = msgspec.structs.replace(self, rate_hz=1000.0, substep_s=0.001, duration_s=1.0, seed=0, law="")
         document = msgspec.to_builtins(common)
+        document["gains"] = json.loads(json.dumps(document["gains"]), parse_int=float)  # 2 counts as 2.0
         if without_motor:
             del document["motor"]
         return hashlib.sha256(msgspec.json.encode(document, order="sorted")).digest()[:8]
@@ -337,7 +354,14 @@ def with_overrides(scenario: Scenario, **changes: Any) -> Scenario:
     """A copy with top-level keys replaced; None leaves a key as it is. Raises `ScenarioError`."""
     chosen = {key: value for key, value in changes.items() if value is not None}
     document = msgspec.to_builtins(scenario) | chosen
-    return _convert(document, "the command line")
+    return _convert(document, Scenario, "the command line")
+
+
+def replace_gains(scenario: Scenario, table: str, **gains: Any) -> Scenario:
+    """A copy with these gains of [gains.TABLE]; they are checked where a law reads them."""
+    as_in_a_file = {name: list(gain) if isinstance(gain, tuple) else gain for name, gain in gains.items()}
+    changed = {**scenario.gains.get(table, {}), **as_in_a_file}
+    return msgspec.structs.replace(scenario, gains={**scenario.gains, table: changed})
 
 
 def scenario_folder() -> Path:
@@ -364,12 +388,12 @@ def load_scenario(path: Path) -> Scenario:
 
     A file may begin with `extends = "other.toml"`, a file beside it: it then holds only what differs from that one.
     """
-    return _convert(_read_document(path, ()), str(path))
+    return _convert(_read_document(path, ()), Scenario, str(path))
 
 
 def parse_scenario(text: str, source: str) -> Scenario:
     """Read and check the text of a whole scenario; `source` names it in errors. Raises `ScenarioError`."""
-    return _convert(_parse_document(text, source), source)
+    return _convert(_parse_document(text, source), Scenario, source)
 
 
 def _read_document(path: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
@@ -388,11 +412,21 @@ def _read_document(path: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
     return _merge(_read_document(path.parent / base, (*extending, path.resolve())), document)
 
 
+_ONCE_IN_CONTROL = {"ude": ("K", "Lambda"), "filters": ("T", "N", "order"), "pd": ("Kp", "Kd")}
+"""The gains that stood in [control] before laws had tables of their own: scenarios in run folders of then are still read."""
+
+
 def _parse_document(text: str, source: str) -> dict[str, Any]:
     try:
-        return tomllib.loads(text)
+        document = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, a number of too many digits, nesting too deep
         raise ScenarioError(f"{source} is not valid TOML: {error}") from None
+    control, gains = document.get("control"), document.setdefault("gains", {})
+    if isinstance(control, dict) and isinstance(gains, dict):
+        for name, keys in _ONCE_IN_CONTROL.items():
+            if name not in gains and (moved := {key: control.pop(key) for key in keys if key in control}):
+                gains[name] = moved
+    return document
 
 
 def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -406,33 +440,37 @@ def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _convert(document: dict[str, Any], source: str) -> Scenario:
+def _convert(document: Any, kind: type[AnyTable], source: str, within: str = "") -> AnyTable:
+    """A document, or a table of one (`within`: its dotted key), as its struct. Raises ScenarioError."""
     try:
-        return msgspec.convert(document, Scenario)
+        return msgspec.convert(document, kind)
     except msgspec.ValidationError as error:
-        raise ScenarioError(_sentence(str(error), source, document)) from None
+        raise ScenarioError(_sentence(str(error), source, within, kind, document)) from None
 
 
-def _sentence(message: str, source: str, document: dict[str, Any]) -> str:
+def _sentence(message: str, source: str, within: str, kind: type[Table], document: Any) -> str:
     """Turn the library's message into a sentence that names the file, the key and the remedy."""
     reason, _, path = message.partition(" - at `")
-    place = path.removesuffix("`").removeprefix("$").removeprefix(".")
-    where = f"{source}, {place}" if place else source
+    key = path.removesuffix("`").removeprefix("$").removeprefix(".")
+    place = ".".join(part for part in (within, key) if part)
     if unknown := re.search(r"unknown field `(.+)`", reason):
-        known = _known_keys(place, document)
-        near = difflib.get_close_matches(unknown[1], known, n=1)
-        remedy = f"did you mean '{near[0]}'?" if near else f"known here: {', '.join(known)}"
-        key = f"{place}.{unknown[1]}" if place else unknown[1]
-        return f"{source}: unknown key '{key}': {remedy}"
+        return unknown_key(source, place, unknown[1], _known_keys(kind, key, document))
     if missing := re.search(r"missing required field `(.+)`", reason):
-        key = f"{place}.{missing[1]}" if place else missing[1]
-        return f"{source}: the key '{key}' is missing: add it"
+        return f"{source}: the key '{f'{place}.' if place else ''}{missing[1]}' is missing: add it"
     reason = reason[0].lower() + reason[1:].replace("`", "")
-    return f"{where}: {reason}" + ("" if ":" in reason else ": change this value")
+    return f"{source}{f', {place}' if place else ''}: {reason}" + ("" if ":" in reason else ": change this value")
 
 
-def _known_keys(place: str, document: dict[str, Any]) -> list[str]:
+def unknown_key(source: object, place: str, key: str, known: list[str]) -> str:
+    """The sentence on a key that is not known in the table `place`, with what was meant or may stand there."""
+    near = difflib.get_close_matches(key, known, n=1)
+    remedy = f"did you mean '{near[0]}'?" if near else f"known here: {', '.join(known)}"
+    return f"{source}: unknown key '{f'{place}.' if place else ''}{key}': {remedy}"
+
+
+def _known_keys(kind: type[Table], place: str, document: dict[str, Any]) -> list[str]:
     if place == "hysteresis":
-        return list((Play if document[place]["model"] == "play" else Backlash).__struct_fields__)
-    table: Any = globals()[Scenario.__annotations__[place]] if place else Scenario
-    return list(table.__struct_fields__)
+        kind = Play if document[place]["model"] == "play" else Backlash
+    elif place:
+        kind = globals()[kind.__annotations__[place]]
+    return list(kind.__struct_fields__)

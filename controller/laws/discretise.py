@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from controller.laws.registry import check_order
+from controller.laws.filters import StateFeedbackFilters
 from controller.laws.state_space import (
     ERROR,
     ERROR_RATE,
@@ -76,7 +76,8 @@ def estimator(order: int, T: float, b: float, period: float, *, derivatives: int
     """The estimator of (18) with G_f of that order; `derivatives` is 2 where m = q, 1 where m = q' (T, period in s).
 
     With p = Ts and T^j uhat = (p^j m - b T^j tau)/A(p), j = derivatives, in observer form: the state is shifted by the
-    first-order hold's share of the newest sample, w = x - G_2 m, so that sample k acts at step k.
+    first-order hold's share of the newest sample, w = x - G_2 m, so that sample k acts at step k. The order is `derivatives`
+    at least.
     """
     size = order
     falling = butterworth(order)[1:]  # a_(n-1) .. a_0
@@ -117,6 +118,7 @@ def estimator(order: int, T: float, b: float, period: float, *, derivatives: int
 
 def realise(
     scenario: Scenario,
+    filters: StateFeedbackFilters,
     *,
     error_gain: FloatArray,
     rate_gain: FloatArray,
@@ -126,14 +128,13 @@ def realise(
 ) -> Realisation:
     """The matrices of a law with k_0 = error_gain, k_1 = rate_gain (6,), f = feed_forward, c = compensate.
 
-    Without compensation the constant bias -uhat0 stands in for the estimate: gravity feed-forward.
-    Raises ScenarioError where G_f is of too low an order for the law to be realisable.
+    Without compensation the constant bias -uhat0 stands in for the estimate: gravity feed-forward. For output feedback the
+    filters are `Filters`, whose order is high enough.
     """
     control = scenario.control
     derivatives = 1 if state_feedback else 2
-    check_order(scenario, derivatives)
     period = scenario.period_ns / NANOSECONDS
-    size = control.order + 1
+    size = filters.order + 1
     law = Realisation(
         A=np.zeros((6, size, size)),
         B=np.zeros((6, size, INPUTS)),
@@ -146,13 +147,13 @@ def realise(
         start_r=np.zeros((6, size, INPUTS)),
         start_u=np.zeros((6, size)),
         uhat0=np.array(control.uhat0),
-        memory_s=np.array(control.T),
+        memory_s=np.array(filters.T),
     )
     measured = VELOCITY if state_feedback else POSITION
     for axis in range(6):
         b = control.b[axis]
-        part = estimator(control.order, control.T[axis], b, period, derivatives=derivatives)
-        n = control.order
+        part = estimator(filters.order, filters.T[axis], b, period, derivatives=derivatives)
+        n = filters.order
         law.A[axis, :n, :n] = part.A
         law.B[axis, :n, measured] = part.B
         law.B_tau[axis, :n] = part.B_tau
@@ -167,8 +168,8 @@ def realise(
             law.D[axis, ERROR_RATE] = -rate_gain[axis] / b
         else:
             # v_k = a v_(k-1) + (1 - a)(e_k - e_(k-1))/Ts with the state s_k = a v_(k-1) - (1 - a)/Ts e_(k-1), v_0 = 0.
-            pole = np.exp(-control.N[axis] * period)
-            slope = -np.expm1(-control.N[axis] * period) / period
+            pole = np.exp(-filters.N[axis] * period)
+            slope = -np.expm1(-filters.N[axis] * period) / period
             law.A[axis, n, n] = pole
             law.B[axis, n, ERROR] = (pole - 1.0) * slope
             law.start_r[axis, n, ERROR] = -slope

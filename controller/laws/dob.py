@@ -9,16 +9,17 @@ the baseline's gains or from its missing feed-forward.
 
 from __future__ import annotations
 
-from controller.laws.pd import pd_gains
+from controller.laws.filters import Filters
+from controller.laws.pd import PdGains, with_pd_gains
 from controller.laws.state_space import Realisation
 from protocol.scenario import Scenario
 
 
-def dob(scenario: Scenario) -> Realisation:
+def dob(scenario: Scenario, gains: PdGains, filters: Filters) -> Realisation:
     """Without feed-forward."""
-    return pd_gains(scenario, feed_forward=False, compensate=True)
+    return with_pd_gains(scenario, gains, filters, feed_forward=False, compensate=True)
 
 
-def dob_ff(scenario: Scenario) -> Realisation:
+def dob_ff(scenario: Scenario, gains: PdGains, filters: Filters) -> Realisation:
     """With the feed-forward of q_d''."""
-    return pd_gains(scenario, feed_forward=True, compensate=True)
+    return with_pd_gains(scenario, gains, filters, feed_forward=True, compensate=True)

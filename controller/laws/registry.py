@@ -1,49 +1,47 @@
-"""The registry of the control laws: one line each. A law's own file is loaded when the law is made."""
+"""The registry of the control laws: one row each. A law's own file is loaded when the law is made or its gains are read."""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
+from controller.laws.state_space import Realisation
 from protocol.errors import ScenarioError, UsageError
-from protocol.scenario import Scenario
-
-if TYPE_CHECKING:
-    from controller.laws.state_space import Realisation
+from protocol.scenario import Scenario, Table, unknown_key
 
 
 class LawEntry(NamedTuple):
-    """What is known of a law without loading it.
+    """What is known of a law without loading it; places are module:name.
 
     number          what logs know it by (LAW_INDEX): it never changes, and goes to no other law
-    place           module:function that builds it
+    place           the function that makes its matrices of the scenario and its gains
+    gains           its tables in the scenario's [gains], name -> struct, in the order in which the function takes them
     needs_velocity  state feedback: it flies in `simulate` only
     """
 
     number: int
     place: str
+    gains: Mapping[str, str]
     needs_velocity: bool
     summary: str
 
 
+_UDE = {"ude": "controller.laws.ude:UdeGains", "filters": "controller.laws.filters:Filters"}
+_PD = {"pd": "controller.laws.pd:PdGains", "filters": "controller.laws.filters:Filters"}
+_STATE = {**_UDE, "filters": "controller.laws.filters:StateFeedbackFilters"}
+
 LAWS: Mapping[str, LawEntry] = MappingProxyType(
     {
-        "ude": LawEntry(0, "controller.laws.ude:ude", False, "the paper's output feedback with the estimator (21)"),
-        "ude_state": LawEntry(
-            1, "controller.laws.ude:ude_state", True, "the paper's state feedback (20); in `simulate` only"
-        ),
-        "pd": LawEntry(2, "controller.laws.pd:pd", False, "PD"),
-        "dob": LawEntry(3, "controller.laws.dob:dob", False, "PD and a disturbance observer"),
-        "dob_ff": LawEntry(
-            4, "controller.laws.dob:dob_ff", False, "the same with feed-forward of the reference's acceleration"
-        ),
-        "uncompensated": LawEntry(
-            5, "controller.laws.ude:uncompensated", False, "the UDE law without its estimate (G_f = 0)"
-        ),
+        "ude": LawEntry(0, "controller.laws.ude:ude", _UDE, False, "the paper's output feedback with the estimator (21)"),
+        "ude_state": LawEntry(1, "controller.laws.ude:ude_state", _STATE, True, "the paper's state feedback (20)"),
+        "pd": LawEntry(2, "controller.laws.pd:pd", _PD, False, "PD"),
+        "dob": LawEntry(3, "controller.laws.dob:dob", _PD, False, "PD and a disturbance observer"),
+        "dob_ff": LawEntry(4, "controller.laws.dob:dob_ff", _PD, False, "`dob` with feed-forward of the reference's q_d''"),
+        "uncompensated": LawEntry(5, "controller.laws.ude:uncompensated", _UDE, False, "`ude` without its estimate: G_f = 0"),
     }
-)
+)  # fmt: skip
 """A new law takes the next number; one that is taken out leaves its own unused."""
 
 
@@ -54,23 +52,37 @@ def law_entry(name: str) -> LawEntry:
     return LAWS[name]
 
 
-def refuse_on_a_link(scenario: Scenario) -> None:
-    """Raise UsageError or ScenarioError where the scenario's law cannot fly on a link, which carries no velocities.
+def gains_tables() -> dict[str, str]:
+    """Every table of gains that a law has, in the order of the registry: name -> place of its struct."""
+    return {name: place for entry in LAWS.values() for name, place in entry.gains.items()}
 
-    The same errors come from making and stepping the law; this asks for none of what that needs.
+
+def declared_gains(scenario: Scenario) -> dict[str, type[Table]]:
+    """The structs of the tables of gains that the scenario has or its law needs. Raises UsageError for a law there is not."""
+    own = law_entry(scenario.law).gains
+    places = {**gains_tables(), **own}  # two laws may ask different things of a table that they share
+    return {name: load(place) for name, place in places.items() if name in own or name in scenario.gains}
+
+
+def check_law(scenario: Scenario, source: object = None) -> None:
+    """Raise UsageError where the scenario's law is none, ScenarioError where a table of gains is not as its laws declare it.
+
+    source: names the file in the sentence. Loads the files of these laws, and no more.
     """
+    declared = declared_gains(scenario)
+    for name in scenario.gains:
+        if name not in declared:
+            named = source or f"scenario {scenario.name}"
+            raise ScenarioError(unknown_key(named, "gains", name, list(gains_tables())))
+    for name, struct in declared.items():
+        scenario.read_gains(name, struct, source)
+
+
+def refuse_on_a_link(scenario: Scenario, source: object = None) -> None:
+    """`check_law`; raises UsageError too where the law cannot fly on a link, which carries no velocities."""
+    check_law(scenario, source)
     if law_entry(scenario.law).needs_velocity:
         raise UsageError(velocity_sentence(scenario.law))
-    check_order(scenario, 2)
-
-
-def check_order(scenario: Scenario, least: int) -> None:
-    """Raise ScenarioError where the filter G_f cannot be differentiated `least` times."""
-    if scenario.control.order < least:
-        raise ScenarioError(
-            f"scenario {scenario.name}, control.order: output feedback needs a filter of order {least} or more, "
-            f"this one has {scenario.control.order}: set control.order = {least}"
-        )
 
 
 def velocity_sentence(name: str) -> str:
@@ -83,6 +95,13 @@ def velocity_sentence(name: str) -> str:
 
 def make_realisation(name: str, scenario: Scenario) -> Realisation:
     """The matrices of the law called `name`, without its kernels. Raises as `make_law`."""
-    module, _, function = law_entry(name).place.partition(":")
-    realisation: Realisation = getattr(importlib.import_module(module), function)(scenario)
+    entry = law_entry(name)
+    gains = [scenario.read_gains(table, load(place)) for table, place in entry.gains.items()]
+    realisation: Realisation = load(entry.place)(scenario, *gains)
     return realisation
+
+
+def load(place: str) -> Any:
+    """What stands at a place, module:name."""
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(module), name)

@@ -11,32 +11,52 @@ Assumptions: b is near the true input gain over inertia; the bandwidth 1/T cover
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Annotated
 
-from controller.laws.discretise import realise
+from controller.laws.filters import Filters, StateFeedbackFilters
+from controller.laws.gains import LinkParameter
 from controller.laws.state_space import Realisation
-from protocol.scenario import Scenario
+from protocol.scenario import Positive6, Scenario, Table
 
 
-def ude(scenario: Scenario) -> Realisation:
+class UdeGains(Table, frozen=True):
+    """The table [gains.ude]: K (13) and Lambda (11), 1/s."""
+
+    K: Annotated[Positive6, LinkParameter("LAW_K", "gain K (13), 1/s")]
+    Lambda: Annotated[Positive6, LinkParameter("LAW_LAMBDA", "gain Lambda (11), 1/s")]
+
+
+def ude(scenario: Scenario, gains: UdeGains, filters: Filters) -> Realisation:
     """Output feedback (21)."""
-    return _paper_law(scenario)
+    return _paper_law(scenario, gains, filters)
 
 
-def ude_state(scenario: Scenario) -> Realisation:
+def ude_state(scenario: Scenario, gains: UdeGains, filters: StateFeedbackFilters) -> Realisation:
     """State feedback (20): the true q_e' in place of D q_e, and uhat = s G_f q' - b G_f tau. It needs the velocity."""
-    return _paper_law(scenario, state_feedback=True)
+    return _paper_law(scenario, gains, filters, state_feedback=True)
 
 
-def uncompensated(scenario: Scenario) -> Realisation:
+def uncompensated(scenario: Scenario, gains: UdeGains, filters: Filters) -> Realisation:
     """The same gains with G_f = 0: the estimate stays what it was at the start (`uhat0`)."""
-    return _paper_law(scenario, compensate=False)
+    return _paper_law(scenario, gains, filters, compensate=False)
 
 
-def _paper_law(scenario: Scenario, *, compensate: bool = True, state_feedback: bool = False) -> Realisation:
-    k, lam = np.array(scenario.control.K), np.array(scenario.control.Lambda)
+def _paper_law(
+    scenario: Scenario,
+    gains: UdeGains,
+    filters: StateFeedbackFilters,
+    *,
+    compensate: bool = True,
+    state_feedback: bool = False,
+) -> Realisation:
+    import numpy as np  # here: `fwav-hil run` checks the gains before it starts anything, and need not wait for NumPy
+
+    from controller.laws.discretise import realise
+
+    k, lam = np.array(gains.K), np.array(gains.Lambda)
     return realise(
         scenario,
+        filters,
         error_gain=k * lam,
         rate_gain=k + lam,
         feed_forward=True,

@@ -106,8 +106,9 @@ def latency(
     from fwav_hil.latency.study import LONGEST_PROBING_S, beside, closed_loop
     from fwav_hil.run import check_link
     from fwav_hil.run_folder import new_folder
+    from protocol.scenario import find_scenario
 
-    refuse_on_a_link(chosen)
+    refuse_on_a_link(chosen, find_scenario(scenario))
     check_link(link)
     compile_kernels(chosen)
     folder = new_folder(chosen, out)

@@ -20,16 +20,18 @@ import msgspec
 import numpy as np
 from scipy.optimize import Bounds, OptimizeResult, differential_evolution
 
+from controller.laws.filters import Filters
 from controller.laws.law import Law, make_law
 from controller.laws.registry import make_realisation
 from controller.laws.state_space import Realisation
+from controller.laws.ude import UdeGains
 from fwav_hil.score import SETTLED_S, tracking_error
 from fwav_hil.simulate import simulate
 from fwav_hil.studies.flight_check import judge_flight
 from fwav_hil.studies.loop_model import channels_of
 from protocol.errors import UsageError
 from protocol.messages import AXES, FloatArray
-from protocol.scenario import NANOSECONDS, Delay, Scenario
+from protocol.scenario import NANOSECONDS, Delay, Scenario, Vector6, replace_gains
 
 MARGIN = 2.0
 _SPARE = 1.01
@@ -41,6 +43,9 @@ SEARCHED = {
     "uncompensated": ("K", "Lambda", "N"),
 }
 """The gains that a law has. The baselines have their own, Kp and Kd, which are not searched for."""
+
+TABLES = {"K": "ude", "Lambda": "ude", "T": "filters", "N": "filters"}
+"""The table of each, within the scenario's [gains]."""
 
 _BOUNDS = {"K": (0.02, 3.0), "Lambda": (0.003, 1.0), "T": (0.2, 30.0), "N": (0.2, 30.0)}
 """Lowest and highest of each, in units of 1/d (T: of d), d being the delay and one and a half periods."""
@@ -82,13 +87,20 @@ class Task(msgspec.Struct, frozen=True):
 
 def with_gains(scenario: Scenario, axes: Iterable[int], names: Iterable[str], values: Iterable[float]) -> Scenario:
     """The scenario with these gains on these axes."""
-    changed = {}
+    axes = tuple(axes)
     for name, value in zip(names, values, strict=True):
-        gains = list(getattr(scenario.control, name))
+        gains = list(gain_of(scenario, name))
         for axis in axes:
             gains[axis] = float(value)
-        changed[name] = tuple(gains)
-    return msgspec.structs.replace(scenario, control=msgspec.structs.replace(scenario.control, **changed))
+        scenario = replace_gains(scenario, TABLES[name], **{name: gains})
+    return scenario
+
+
+def gain_of(scenario: Scenario, name: str) -> Vector6:
+    """A gain of those searched, on each axis."""
+    table = TABLES[name]
+    gain: Vector6 = getattr(scenario.read_gains(table, UdeGains if table == "ude" else Filters), name)
+    return gain
 
 
 def shortfall(scenario: Scenario, axes: Iterable[int], margin: float = MARGIN, law: Realisation | None = None) -> float:
@@ -210,7 +222,7 @@ def search(
         start, _ = flown_error(scenario, seeds)
         held = None if start is None else tuple(tuple(row[list(group.axes)].tolist()) for row in start)
         task = Task(scenario, group.name, tuple(group.axes), names, seeds, held)
-        own = np.log([getattr(scenario.control, name)[group.axes[0]] for name in names])
+        own = np.log([gain_of(scenario, name)[group.axes[0]] for name in names])
         low, high = np.array(limits).T
 
         result = differential_evolution(
@@ -253,7 +265,7 @@ def _teller(name: str, progress: Callable[[str, float], None]) -> Callable[[Opti
 def _rounded(scenario: Scenario, group: Group, names: Iterable[str]) -> Scenario:
     """Gains to three digits, where the margins stand it."""
     names = tuple(names)
-    values = [float(f"{getattr(scenario.control, name)[group.axes[0]]:.3g}") for name in names]
+    values = [float(f"{gain_of(scenario, name)[group.axes[0]]:.3g}") for name in names]
     plain = with_gains(scenario, group.axes, names, values)
     return plain if shortfall(plain, group.axes) == 0.0 else scenario
 

@@ -62,6 +62,7 @@ def design_command(
     file; what it gains over the scenario's own gains is flown over seeds that the search has not seen.
     """
     from bridge.process import StopFlag
+    from controller.laws.registry import check_law
     from fwav_hil.studies.design import gains_of, search
     from fwav_hil.studies.design_pool import cores, mapping
     from fwav_hil.studies.design_result import judge_design, print_design, scenario_text, with_delay
@@ -74,6 +75,7 @@ def design_command(
     if delay_s is not None:
         start = with_delay(start, delay_s)
     gains_of(start)
+    check_law(start, base_path)
     refuse(out)
     stop = StopFlag()
     stop.install()

@@ -13,7 +13,17 @@ import tomli_w
 from rich.table import Table
 
 from bridge.process import StopFlag
-from fwav_hil.studies.design import GROUPS, Comparison, Found, at_twice_the_delay, compare, flown_error, gains_of
+from fwav_hil.studies.design import (
+    GROUPS,
+    TABLES,
+    Comparison,
+    Found,
+    at_twice_the_delay,
+    compare,
+    flown_error,
+    gain_of,
+    gains_of,
+)
 from fwav_hil.studies.margin import ChannelMargin, Verdict, judge, linear_margins
 from fwav_hil.tables import plain_console, show_error
 from protocol.messages import AXES
@@ -46,7 +56,6 @@ class Design(msgspec.Struct, frozen=True, kw_only=True):
 
     def as_json(self) -> dict[str, Any]:
         """As `--json` writes it."""
-        control = self.designed.control
         return {
             "scenario": self.start.name,
             "law": self.designed.law,
@@ -57,7 +66,7 @@ class Design(msgspec.Struct, frozen=True, kw_only=True):
             "generations": self.generations,
             "evaluations": self.evaluations,
             "gains": {
-                group.name: {name: getattr(control, name)[group.axes[0]] for name in gains_of(self.designed)}
+                group.name: {name: gain_of(self.designed, name)[group.axes[0]] for name in gains_of(self.designed)}
                 for group in GROUPS
             },
             "verdict": self.verdict.verdict,
@@ -118,7 +127,7 @@ def scenario_text(result: Design, base_path: Path, out: Path) -> str:
     named = msgspec.structs.replace(designed, name=name, description=description)
     names = gains_of(designed)
     lines = [
-        f"# {', '.join(names)} of [control] are designed, by `fwav-hil design`, for a link of {start.rate_hz:g} Hz with",
+        f"# {', '.join(names)} of [gains] are designed, by `fwav-hil design`, for a link of {start.rate_hz:g} Hz with",
         f"# {delay_ms:g} ms of total delay, and {start.name}'s noise and limits; optimiser seed {result.seed}, "
         f"{result.generations} generations, {result.flights} flights each.",
         f"# Gain margin at least {_least(m.gain_margin for m in result.margins.values()):.2f} both ways, largest delay "
@@ -131,10 +140,11 @@ def scenario_text(result: Design, base_path: Path, out: Path) -> str:
     whole = msgspec.to_builtins(named)
     if base_path.resolve().parent != out.resolve().parent:
         return "\n".join(lines) + "\n\n" + tomli_w.dumps(whole)
-    base_control = msgspec.to_builtins(start.control)
     changes: dict[str, Any] = {"extends": base_path.name}
     changes |= {key: whole[key] for key in ("name", "description", "rate_hz", "law", "substep_s", "delay")}
-    changes["control"] = {key: whole["control"][key] for key in base_control if key in names}
+    changes["gains"] = {}
+    for name in names:
+        changes["gains"].setdefault(TABLES[name], {})[name] = whole["gains"][TABLES[name]][name]
     return "\n".join(lines) + "\n\n" + tomli_w.dumps(changes)
 
 
@@ -162,7 +172,7 @@ def print_design(result: Design, *, to_stderr: bool = False) -> None:
             axes = [AXES[axis] for axis in group.axes]
             gains.add_row(
                 f"{group.name}, {what}",
-                *(f"{getattr(scenario.control, name)[group.axes[0]]:.3g}" for name in gains_of(designed)),
+                *(f"{gain_of(scenario, name)[group.axes[0]]:.3g}" for name in gains_of(designed)),
                 f"{_least(margins[axis].gain_margin for axis in axes):.2f}",
                 f"{1e3 * _least(margins[axis].max_delay_s for axis in axes):.1f} ms",
             )

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from controller.laws.reference import reference_trajectory
+from controller.laws.ude import UdeGains
 from fwav_hil.simulate import Simulation
 from protocol.messages import FloatArray
 from protocol.scenario import NANOSECONDS, Scenario
@@ -32,7 +33,8 @@ class Bound(NamedTuple):
 
 def lyapunov(scenario: Scenario, result: Simulation) -> Bound:
     """The bound along a run; (n, 6), in m^2/s^2 and rad^2/s^2."""
-    k, lam = np.array(scenario.control.K), np.array(scenario.control.Lambda)
+    gains = scenario.read_gains("ude", UdeGains)
+    k, lam = np.array(gains.K), np.array(gains.Lambda)
     desired = reference_trajectory(scenario.reference, len(result.t_ns), scenario.period_ns)
     error = result.q - desired[:, 0]
     error[:, 3:] = (error[:, 3:] + np.pi) % (2.0 * np.pi) - np.pi

@@ -22,7 +22,7 @@ from fwav_hil.studies.loop_model import (
     stable_gains,
 )
 from protocol.messages import AXES
-from protocol.scenario import NANOSECONDS, Backlash, Scenario, Vector6, with_overrides
+from protocol.scenario import NANOSECONDS, Backlash, Scenario, Vector6, replace_gains, with_overrides
 
 LEAST_GAIN_MARGIN = 2.0
 LEAST_DELAY_MARGIN = 2.0
@@ -115,7 +115,7 @@ def with_gain_ratio(scenario: Scenario, ratio: float) -> Scenario:
 
 def with_derivative_pole(scenario: Scenario, pole: float) -> Scenario:
     """The scenario with N = pole (1/s) in every channel."""
-    return msgspec.structs.replace(scenario, control=msgspec.structs.replace(scenario.control, N=(pole,) * 6))
+    return replace_gains(scenario, "filters", N=(pole,) * 6)
 
 
 def at_rate(scenario: Scenario, rate_hz: float) -> Scenario:

@@ -52,11 +52,14 @@ def margin_command(
     from rich.console import Console
     from rich.progress import Progress
 
+    from controller.laws.registry import check_law
     from fwav_hil.studies.margin import at_rate, with_derivative_pole, with_gain_ratio
     from fwav_hil.studies.margin_study import STEPS, as_json, study
     from fwav_hil.studies.margin_tables import print_study
 
-    chosen = with_overrides(load_scenario(find_scenario(scenario)), law=law)
+    path = find_scenario(scenario)
+    chosen = with_overrides(load_scenario(path), law=law)
+    check_law(chosen, path)
     if rate is not None:
         chosen = at_rate(chosen, rate)
     if gain_ratio is not None:

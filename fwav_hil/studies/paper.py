@@ -8,21 +8,23 @@ from __future__ import annotations
 
 import csv
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
 from controller.laws.law import make_law
+from controller.laws.ude import UdeGains
 from fwav_hil.run import RunOptions, run
 from fwav_hil.run_folder import FILES, new_folder
 from fwav_hil.score import scores
 from fwav_hil.simulate import Simulation, simulate
 from plant_emulator.plant.truth import load_truth
 from protocol.messages import AXES
-from protocol.scenario import Scenario
+from protocol.scenario import Scenario, replace_gains
 
 PAPER_TABLES = Path(__file__).with_name("paper_tables.csv")
 CENTIMETRES = {axis: 100.0 if axis in AXES[:3] else 1.0 for axis in AXES}
@@ -30,36 +32,36 @@ MEASURES = ("rmse", "mae")
 
 
 class Condition(NamedTuple):
-    """One column of a table: the paper's table and name for it, the law, and what is changed in the scenario's gains."""
+    """One column of a table: the paper's table and name for it, the law, and what is changed in which table of its gains."""
 
     table: str
     name: str
     law: str
-    control: dict[str, Any]
+    gains_table: str = ""
+    changed: Mapping[str, Any] = MappingProxyType({})
 
     def scenario(self, base: Scenario) -> Scenario:
         """The scenario of this condition."""
-        return msgspec.structs.replace(
-            base, law=self.law, control=msgspec.structs.replace(base.control, **self.control)
-        )
+        scenario: Scenario = msgspec.structs.replace(base, law=self.law)
+        return replace_gains(scenario, self.gains_table, **self.changed) if self.changed else scenario
 
 
 def conditions(base: Scenario) -> tuple[Condition, ...]:
     """Every column of tables II, III and IV, and two of our own (table "-") that the paper has no numbers for."""
-    control = base.control
-    products = tuple(k * lam / b for k, lam, b in zip(control.K, control.Lambda, control.b, strict=True))
-    sums = tuple((k + lam) / b for k, lam, b in zip(control.K, control.Lambda, control.b, strict=True))
+    gains = base.read_gains("ude", UdeGains)
+    products = tuple(k * lam / b for k, lam, b in zip(gains.K, gains.Lambda, base.control.b, strict=True))
+    sums = tuple((k + lam) / b for k, lam, b in zip(gains.K, gains.Lambda, base.control.b, strict=True))
     return (
-        Condition("II", "PD", "pd", {}),
-        Condition("II", "DOB", "dob", {}),
-        Condition("II", "UDE", "ude", {}),
-        Condition("III", "with_compensation", "ude", {}),
-        Condition("III", "without_compensation", "uncompensated", {}),
-        Condition("IV", "T=0.01", "ude", {"T": (0.01,) * 6}),
-        Condition("IV", "T=0.1", "ude", {"T": (0.1,) * 6}),
-        Condition("IV", "T=1", "ude", {"T": (1.0,) * 6}),
-        Condition("-", "DOB_equal_gains_feed_forward", "dob_ff", {"Kp": products, "Kd": sums}),
-        Condition("-", "UDE_state_feedback", "ude_state", {}),
+        Condition("II", "PD", "pd"),
+        Condition("II", "DOB", "dob"),
+        Condition("II", "UDE", "ude"),
+        Condition("III", "with_compensation", "ude"),
+        Condition("III", "without_compensation", "uncompensated"),
+        Condition("IV", "T=0.01", "ude", "filters", {"T": (0.01,) * 6}),
+        Condition("IV", "T=0.1", "ude", "filters", {"T": (0.1,) * 6}),
+        Condition("IV", "T=1", "ude", "filters", {"T": (1.0,) * 6}),
+        Condition("-", "DOB_equal_gains_feed_forward", "dob_ff", "pd", {"Kp": products, "Kd": sums}),
+        Condition("-", "UDE_state_feedback", "ude_state"),
     )
 
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from controller.laws.law import Law, LawState, make_law
-from controller.laws.registry import LAWS
+from controller.laws.registry import law_entry, load
+from controller.parameters import parameters_of, value_of
 from fwav_hil.simulate import simulate
 from protocol.errors import UsageError
 from protocol.messages import FloatArray
@@ -68,7 +69,7 @@ def wild_samples(period_ns: int, seed: int, count: int = 60) -> list[Sample]:
 class LawContract:
     """The tests; `name` is the law's in the registry, `number` the one that logs know it by, for ever.
 
-    Samples are those of a quiet flight with that very law.
+    Samples are those of a quiet flight of `flapper` with that very law, and with its gains' defaults where it has no others.
     """
 
     name: ClassVar[str]
@@ -188,7 +189,7 @@ class LawContract:
     def test_velocities_are_ignored_unless_they_are_asked_for(self, law: Law, samples: list[Sample]) -> None:
         rng = np.random.default_rng(3)
         other = [(t_ns, q, q_dot + 0.1 * rng.normal(size=6)) for t_ns, q, q_dot in samples]
-        blind = not LAWS[self.name].needs_velocity
+        blind = not law_entry(self.name).needs_velocity
         assert (fly(law, other).tobytes() == fly(law, samples).tobytes()) == blind
 
     def test_without_velocities_a_law_flies_blind_or_says_why_not(self, law: Law, samples: list[Sample]) -> None:
@@ -202,7 +203,17 @@ class LawContract:
     def test_a_law_knows_its_name_and_its_period(self, law: Law, scenario: Scenario) -> None:
         assert law.name == self.name
         assert law.period_ns == scenario.period_ns
-        assert law.needs_velocity == LAWS[self.name].needs_velocity
+        assert law.needs_velocity == law_entry(self.name).needs_velocity
 
     def test_a_law_keeps_its_number(self) -> None:
-        assert LAWS[self.name].number == self.number
+        assert law_entry(self.name).number == self.number
+
+    def test_every_gain_is_a_parameter_by_a_name_of_its_own(self, scenario: Scenario) -> None:
+        parameters = parameters_of(scenario)
+        said = {(parameter.table, parameter.field) for parameter in parameters}
+        for table, place in law_entry(self.name).gains.items():
+            assert {(f"gains.{table}", gain) for gain in load(place).__struct_fields__} <= said
+        names = [parameter.name for parameter in parameters]
+        assert len(set(names)) == len(names)
+        assert all(name.isascii() and name.isupper() and len(name) <= 16 for name in names)
+        assert np.isfinite([value_of(scenario, parameter) for parameter in parameters]).all()

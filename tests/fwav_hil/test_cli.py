@@ -217,6 +217,24 @@ class TestWrongArguments:
         assert ended.code == 2
         assert ended.sentence == f"mine.toml: unknown key '{key}': did you mean '{meant}'?"
 
+    @pytest.mark.parametrize("command", ["run", "simulate", "controller", "latency", "margin", "design"])
+    @pytest.mark.parametrize("law", ["ude", "pd"])
+    def test_a_wrong_gain_is_refused_whichever_law_flies_before_anything_starts(
+        self, shell: Shell, tmp_path: Path, no_processes: None, command: str, law: str
+    ) -> None:
+        if command == "design":
+            law = "ude"  # which searches for no other's gains
+        file = write_scenario(tmp_path / "mine.toml", law=law, gains={**FLAPPER.gains, "ude": {"Lamda": [1.0] * 6}})
+        ended = shell(command, file, *(("--out", "designed.toml") if command == "design" else ()))
+        assert ended.code == 2
+        assert ended.sentence == f"{file}: unknown key 'gains.ude.Lamda': did you mean 'Lambda'?"
+        assert set(contents(tmp_path)) == {"mine.toml"}
+
+    def test_an_emulator_has_no_use_for_gains(self, shell: Shell, tmp_path: Path) -> None:
+        file = write_scenario(tmp_path / "mine.toml", gains={"another": {"gain": 1.0}})
+        ended = shell("emulator", file, "--link", "mem://an-emulator-alone", "--wait", "0.1")
+        assert (ended.code, ended.out) == (4, "")
+
     @pytest.mark.parametrize("command", ["run", "simulate", "emulator", "controller"])
     def test_a_rate_that_makes_no_sense_is_refused(self, shell: Shell, command: str) -> None:
         ended = shell(command, "--rate", "333")

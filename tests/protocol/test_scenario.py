@@ -6,7 +6,7 @@ import copy
 import math
 import re
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,14 +17,18 @@ import tomli_w
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from controller.laws.registry import check_law, gains_tables
 from protocol.errors import ScenarioError
 from protocol.scenario import (
     Backlash,
     Play,
+    Positive6,
     Scenario,
+    Table,
     find_scenario,
     load_scenario,
     parse_scenario,
+    replace_gains,
     scenario_folder,
     with_overrides,
 )
@@ -33,14 +37,18 @@ FILES = sorted(scenario_folder().glob("*.toml"))
 FLAPPER = load_scenario(scenario_folder() / "flapper.toml")
 FULL: dict[str, Any] = tomllib.loads(FLAPPER.to_toml())
 """Every key of a scenario, the defaults too."""
-TABLES = ["", *(key for key, value in FULL.items() if isinstance(value, dict))]
+TABLES = [
+    "",
+    *(key for key, value in FULL.items() if isinstance(value, dict)),
+    *(f"gains.{key}" for key in FULL["gains"]),
+]
 SOURCE = "here/my.toml"
 
 CHOSEN_BY_THE_COMMAND_LINE = {"rate_hz", "substep_s", "duration_s", "seed", "law"}
 """What one end may choose for itself, so that it does not count in the digest."""
 OPTIONAL = {
     *("initial.velocity", "initial.attitude_rate", "initial.command", "actuators.safe", "actuators.staleness_s"),
-    *("reference.phase_rad", "reference.initial", "control.order", "control.uhat0", "control.rotate_force"),
+    *("reference.phase_rad", "reference.initial", "control.uhat0", "control.rotate_force"),
     *("delay.samples", "delay.seconds", "noise.position", "noise.attitude"),
     *("world.latitude_deg", "world.longitude_deg", "world.altitude"),
     *("world.magnetic_field_ned", "world.temperature_celsius", "wire.emulator_component"),
@@ -66,13 +74,18 @@ MISSING = object()
 NEARLY_ONE = st.sampled_from([0.0, 1e-12, -1e-12, 1e-8, -1e-8])
 
 
+def table_at(place: str, document: dict[str, Any] = FULL) -> dict[str, Any]:
+    """The table at a dotted key; "": the document."""
+    for step in filter(None, place.split(".")):
+        document = document[step]
+    return document
+
+
 def changed(key: str, value: object, document: dict[str, Any] = FULL) -> dict[str, Any]:
     """The document with one dotted key set, or left out."""
     document = copy.deepcopy(document)
-    *place, name = key.split(".")
-    table = document
-    for step in place:
-        table = table[step]
+    place, _, name = key.rpartition(".")
+    table = table_at(place, document)
     if value is MISSING:
         del table[name]
     else:
@@ -81,7 +94,10 @@ def changed(key: str, value: object, document: dict[str, Any] = FULL) -> dict[st
 
 
 def parse(document: dict[str, Any]) -> Scenario:
-    return parse_scenario(tomli_w.dumps(document), SOURCE)
+    """The scenario as a command loads it that flies a law: the gains checked too."""
+    scenario = parse_scenario(tomli_w.dumps(document), SOURCE)
+    check_law(with_overrides(scenario, law="ude"), SOURCE)
+    return scenario
 
 
 def refusal(document: dict[str, Any]) -> str:
@@ -131,8 +147,8 @@ class TestFiles:
                 continue
             held: Any = scenario
             for step in key.split("."):
-                held = getattr(held, step)
-            assert held == (tuple(value) if isinstance(value, list) else value), key
+                held = held[step] if isinstance(held, Mapping) else getattr(held, step)
+            assert held == (tuple(value) if isinstance(held, tuple) else value), key
 
     def test_there_are_the_paper_and_the_flapper(self) -> None:
         assert {"paper", "flapper"} <= {file.stem for file in FILES}
@@ -228,14 +244,16 @@ class TestUnknownAndMissingKeys:
     def test_an_unknown_key_is_named_with_its_place_and_those_that_are_known(self, table: str) -> None:
         key = f"{table}.xyzzy" if table else "xyzzy"
         message = refusal(changed(key, 1.0))
-        known = (FULL[table] if table else FULL).keys() - {"model"}
+        known = table_at(table).keys() - {"model"}
         listed = message.partition("known here: ")[2].split(", ")
         assert f"unknown key '{key}'" in message
-        assert set(listed) == known
+        assert set(listed) == (gains_tables().keys() if table == "gains" else known)
+        assert set(listed) >= known
 
     @pytest.mark.parametrize(
         ("key", "meant"),
-        [("lwa", "law"), ("dealy", "delay"), ("body.gravty", "gravity"), ("control.lambda", "Lambda")]
+        [("lwa", "law"), ("dealy", "delay"), ("body.gravty", "gravity"), ("gains.ude.lambda", "Lambda")]
+        + [("control.rotate_froce", "rotate_force"), ("gains.udee", "ude"), ("gains.filters.ordre", "order")]
         + [
             ("hysteresis.kapa", "kappa"),
             ("world.altitud", "altitude"),
@@ -294,7 +312,15 @@ class TestValues:
     @pytest.mark.parametrize(
         "key",
         ["body.mass", "body.inertia", "hysteresis.h", "hysteresis.chi", "actuators.scale", "actuators.staleness_s"]
-        + ["reference.A_d", "reference.B_d", "control.K", "control.Lambda", "control.b", "control.T", "control.N"]
+        + [
+            "reference.A_d",
+            "reference.B_d",
+            "control.b",
+            "gains.ude.K",
+            "gains.ude.Lambda",
+            "gains.filters.T",
+            "gains.filters.N",
+        ]
         + ["rate_hz", "duration_s", "substep_s"],
     )
     def test_zero_and_less_are_refused_where_there_is_no_such_thing(self, key: str) -> None:
@@ -304,7 +330,7 @@ class TestValues:
     @pytest.mark.parametrize(
         "key",
         ["body.gravity", "hysteresis.kappa", "noise.position", "noise.attitude", "disturbance.frequency_rad_s"]
-        + ["reference.frequency_rad_s", "control.Kp", "control.Kd", "delay.samples", "delay.seconds", "seed"],
+        + ["reference.frequency_rad_s", "gains.pd.Kp", "gains.pd.Kd", "delay.samples", "delay.seconds", "seed"],
     )
     def test_less_than_zero_is_refused_and_zero_is_not(self, key: str) -> None:
         number = type(LEAVES[key][-1] if isinstance(LEAVES[key], list) else LEAVES[key])
@@ -316,8 +342,8 @@ class TestValues:
         [
             ("delay.samples", 1001),
             ("delay.seconds", 1.5),
-            ("control.order", 0),
-            ("control.order", 7),
+            ("gains.filters.order", 0),
+            ("gains.filters.order", 7),
             ("world.latitude_deg", 90.5),
             ("world.longitude_deg", -180.5),
             ("wire.emulator_component", 1),  # the controller's
@@ -437,6 +463,51 @@ class TestTimes:
         assert scenario.delay_ns == 3 * 4_000_000 + 700_000
 
 
+class TestGains:
+    """Tables that the laws declare: read as the struct of a law, kept as the file has them."""
+
+    class Mine(Table, frozen=True):
+        stiffness: Positive6
+        eager: bool = False
+
+    def test_a_table_is_read_as_its_law_declares_it(self) -> None:
+        scenario = replace_gains(FLAPPER, "mine", stiffness=(1, 2, 3, 4, 5, 6))
+        assert scenario.read_gains("mine", self.Mine) == self.Mine(stiffness=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0))
+        assert "eager" not in scenario.to_toml(), "what the file left to its default is left to it"
+
+    @pytest.mark.parametrize(
+        ("gains", "sentence"),
+        [
+            ({}, "the key 'gains.mine.stiffness' is missing: add it"),
+            ({"stifness": (1.0,) * 6}, "unknown key 'gains.mine.stifness': did you mean 'stiffness'?"),
+            ({"stiffness": (1.0,) * 5 + (0.0,)}, "gains.mine.stiffness[5]: expected float > 0.0: change this value"),
+        ],
+    )
+    def test_what_is_wrong_is_named_with_its_place(self, gains: dict[str, Any], sentence: str) -> None:
+        scenario = replace_gains(FLAPPER, "mine", **gains)
+        for source, named in ((None, "scenario flapper"), (Path("my.toml"), "my.toml")):
+            with pytest.raises(ScenarioError) as caught:
+                scenario.read_gains("mine", self.Mine, source)
+            assert str(caught.value) in (f"{named}: {sentence}", f"{named}, {sentence}")
+
+    def test_gains_are_replaced_in_a_copy(self) -> None:
+        other = replace_gains(FLAPPER, "ude", K=(7.0,) * 6)
+        assert other.gains["ude"] == {"K": [7.0] * 6, "Lambda": FLAPPER.gains["ude"]["Lambda"]}
+        assert {**other.gains, "ude": FLAPPER.gains["ude"]} == FLAPPER.gains == FULL["gains"]
+
+    def test_a_file_of_before_gains_had_tables_is_still_read(self) -> None:
+        """Such as the scenario.toml in a run folder of then: all of them stood in [control]."""
+        gains = FULL["gains"]
+        old = changed("gains", MISSING)
+        old["control"] = {**gains["ude"], "b": FULL["control"]["b"], **gains["filters"], **gains["pd"]} | FULL[
+            "control"
+        ]
+        assert parse(old) == FLAPPER
+
+    def test_a_gain_in_both_places_is_refused(self) -> None:
+        assert "unknown key 'control.K'" in refusal(changed("control.K", [1.0] * 6))
+
+
 class TestNotToml:
     @pytest.mark.parametrize(
         "text",
@@ -511,10 +582,17 @@ class TestDigest:
         assert changed_scenario.digest() == FLAPPER.digest()
         assert changed_scenario.drive_digest() != FLAPPER.drive_digest()
 
-    def test_scenarios_keep_the_digests_they_had_before_there_were_drives(self) -> None:
-        """Written down from the version before: other versions of either end still agree."""
-        had = {"flapper": "d68137f0bd8ed0b1", "paper": "3f4e70ec68cc1837", "paper_disturbed": "45467c91986aa474"}
+    def test_scenarios_keep_the_digests_they_had(self) -> None:
+        """Written down when the gains of a law got a table of their own: other versions of either end still agree."""
+        had = {"flapper": "a8cabc79d278b804", "paper": "c87fc430c41b132b", "paper_disturbed": "499bdc41dc218586"}
         assert {file.stem: load_scenario(file).digest().hex() for file in FILES if file.stem in had} == had
+
+    def test_gains_count_as_numbers_whoever_knows_them(self) -> None:
+        """An emulator, which knows no law, must come to the same as the controller."""
+        whole = parse_scenario(tomli_w.dumps(changed("gains.ude.K", [20, 20, 20, 40, 40, 40])), SOURCE)
+        assert whole.digest() == FLAPPER.digest()
+        for key, value in (("gains.mine", {"a": 1.0}), ("gains.ude.k", 1.0), ("gains.ude.K", [10**400])):
+            assert parse_scenario(tomli_w.dumps(changed(key, value)), SOURCE).digest() != FLAPPER.digest()
 
     def test_a_lag_shorter_than_the_torque_loop_is_refused(self) -> None:
         assert "lag_s" in refusal(changed("motor.lag_s", 1e-5))

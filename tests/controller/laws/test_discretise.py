@@ -15,10 +15,11 @@ from scipy.linalg import expm
 from scipy.signal import butter, lsim
 
 from controller.laws.discretise import Estimator, butterworth, estimator, exponential, realise
+from controller.laws.filters import Filters, StateFeedbackFilters
 from controller.laws.state_space import ERROR, POSITION, REFERENCE_ACCELERATION, VELOCITY, Realisation
 from protocol.errors import ScenarioError
 from protocol.messages import FloatArray
-from protocol.scenario import Scenario, find_scenario, load_scenario
+from protocol.scenario import Scenario, find_scenario, load_scenario, replace_gains
 
 ROOT_2 = math.sqrt(2.0)
 
@@ -106,10 +107,16 @@ def test_at_rest_the_estimate_stays_what_it_was(
 
 def test_output_feedback_needs_a_filter_of_second_order(flapper: Scenario) -> None:
     """As the paper says below (21); with the velocity at hand the first order will do."""
-    first = msgspec.structs.replace(flapper, control=msgspec.structs.replace(flapper.control, order=1))
-    with pytest.raises(ScenarioError, match=r"control\.order.* filter of order 2 or more, this one has 1"):
-        gains_only(first, feed_forward=False, compensate=True)
-    realise(first, error_gain=ONES, rate_gain=ONES, feed_forward=True, compensate=True, state_feedback=True)
+    first = replace_gains(flapper, "filters", order=1)
+    with pytest.raises(
+        ScenarioError, match=r"gains\.filters: .* filter of order 2 or more, this one has 1: set order = 2"
+    ):
+        first.read_gains("filters", Filters)
+    filters = first.read_gains("filters", StateFeedbackFilters)
+    law = realise(
+        first, filters, error_gain=ONES, rate_gain=ONES, feed_forward=True, compensate=True, state_feedback=True
+    )
+    assert law.A.shape == (6, 2, 2)
 
 
 ONES = np.ones(6)
@@ -120,6 +127,7 @@ def gains_only(
 ) -> Realisation:
     return realise(
         scenario,
+        scenario.read_gains("filters", Filters),
         error_gain=error_gain * ONES,
         rate_gain=rate_gain * ONES,
         feed_forward=feed_forward,
@@ -151,7 +159,7 @@ def derivative(scenario: Scenario, axis: int, error: FloatArray) -> FloatArray:
 def test_the_derivative_is_the_design_formula(error: FloatArray, axis: int) -> None:
     scenario = load_scenario(find_scenario("flapper"))
     period = 0.004
-    a = math.exp(-scenario.control.N[axis] * period)
+    a = math.exp(-scenario.read_gains("filters", Filters).N[axis] * period)
     v = [0.0]
     for before, now in zip(error[:-1].tolist(), error[1:].tolist(), strict=True):
         v.append(a * v[-1] + (1.0 - a) * (now - before) / period)
@@ -161,7 +169,7 @@ def test_the_derivative_is_the_design_formula(error: FloatArray, axis: int) -> N
 @pytest.mark.parametrize("axis", [0, 3])
 def test_the_derivative_is_that_of_a_filter_for_straight_lines_between_samples(flapper: Scenario, axis: int) -> None:
     """N s/(s + N), exactly: on a ramp it is slope (1 - e^(-N t)), with the newest sample in it and none before."""
-    n, t = flapper.control.N[axis], 0.004 * np.arange(50)
+    n, t = flapper.read_gains("filters", Filters).N[axis], 0.004 * np.arange(50)
     ramp = np.linspace(5.0, 5.0 + 3.0 * t[-1], len(t))
     assert derivative(flapper, axis, ramp) == pytest.approx(3.0 * (1.0 - np.exp(-n * t)), rel=1e-10, abs=1e-9)
     any_shape = np.sin(40.0 * t) + 0.1 * np.random.default_rng(1).normal(size=50)
@@ -173,7 +181,7 @@ def test_a_step_of_the_error_is_felt_at_once_and_forgotten(flapper: Scenario) ->
     error = np.zeros(60)
     error[20:] = 1.0
     v = derivative(flapper, 0, error)
-    decay = math.exp(-flapper.control.N[0] * 0.004)
+    decay = math.exp(-flapper.read_gains("filters", Filters).N[0] * 0.004)
     assert v[:20].tolist() == [0.0] * 20
     assert v[20:] == pytest.approx((1.0 - decay) / 0.004 * decay ** np.arange(40), rel=1e-9, abs=1e-9)
 
@@ -182,13 +190,13 @@ def test_a_step_of_the_error_is_felt_at_once_and_forgotten(flapper: Scenario) ->
 @pytest.mark.parametrize("feed_forward", [False, True])
 def test_each_gain_does_what_the_common_form_says(flapper: Scenario, feed_forward: bool, compensate: bool) -> None:
     """b tau = f q_d'' - k_1 D q_e - k_0 q_e - c uhat - (1 - c) uhat0, per axis, with D and uhat tested above."""
-    k_0, k_1, period = 7.0, 3.0, 0.004
+    k_0, k_1, period, filters = 7.0, 3.0, 0.004, flapper.read_gains("filters", Filters)
     law = gains_only(flapper, k_0, k_1, feed_forward=feed_forward, compensate=compensate)
     rng = np.random.default_rng(4)
     for axis in range(6):
         r, applied = rng.normal(size=(20, 5)), rng.normal(size=20)
         b, uhat0 = flapper.control.b[axis], flapper.control.uhat0[axis]
-        part = estimator(2, flapper.control.T[axis], b, period, derivatives=2)
+        part = estimator(2, filters.T[axis], b, period, derivatives=2)
         uhat = run(part, r[:, POSITION], applied, uhat0) if compensate else np.full(20, uhat0)
         feed = r[:, REFERENCE_ACCELERATION] if feed_forward else 0.0
         expected = feed - k_1 * derivative(flapper, axis, r[:, ERROR]) - k_0 * r[:, ERROR] - uhat
@@ -197,15 +205,16 @@ def test_each_gain_does_what_the_common_form_says(flapper: Scenario, feed_forwar
 
 
 def test_state_feedback_takes_the_rate_of_the_error_as_it_comes(flapper: Scenario) -> None:
-    k_0, k_1, period = 7.0, 3.0, 0.004
+    k_0, k_1, period, filters = 7.0, 3.0, 0.004, flapper.read_gains("filters", StateFeedbackFilters)
     law = realise(
-        flapper, error_gain=k_0 * ONES, rate_gain=k_1 * ONES, feed_forward=True, compensate=True, state_feedback=True
-    )
+        flapper, filters, error_gain=k_0 * ONES, rate_gain=k_1 * ONES, feed_forward=True, compensate=True,
+        state_feedback=True,
+    )  # fmt: skip
     rng = np.random.default_rng(5)
     for axis in range(6):
         r, applied = rng.normal(size=(20, 5)), rng.normal(size=20)
         b = flapper.control.b[axis]
-        part = estimator(2, flapper.control.T[axis], b, period, derivatives=1)
+        part = estimator(2, filters.T[axis], b, period, derivatives=1)
         uhat = run(part, r[:, VELOCITY], applied, flapper.control.uhat0[axis])
         expected = r[:, REFERENCE_ACCELERATION] - k_1 * r[:, 4] - k_0 * r[:, ERROR] - uhat
         came = b * commands(law, axis, r, applied)

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from controller.laws.law import make_law
+from controller.laws.pd import PdGains
 from controller.laws.reference import reference_trajectory
+from controller.laws.ude import UdeGains
 from fwav_hil.simulate import simulate
-from protocol.scenario import Scenario, Vector6, find_scenario, load_scenario
+from protocol.scenario import Scenario, Vector6, find_scenario, load_scenario, replace_gains
 from tests.contracts.law_contract import WIDE
 
 FLAPPER = load_scenario(find_scenario("flapper"))
@@ -25,16 +27,13 @@ def with_the_gains_of_the_ude() -> Scenario:
 
     With b = 1/m itself the products round, and the two laws differ in their last bits.
     """
-    control = FLAPPER.control
+    gains = FLAPPER.read_gains("ude", UdeGains)
     b = (128.0,) * 3 + (2.0**21, 2.0**21, 2.0**20)
-    return msgspec.structs.replace(
-        FLAPPER,
-        control=msgspec.structs.replace(
-            control,
-            b=b,
-            Kp=quotients(tuple(k * lam for k, lam in zip(control.K, control.Lambda, strict=True)), b),
-            Kd=quotients(tuple(k + lam for k, lam in zip(control.K, control.Lambda, strict=True)), b),
-        ),
+    return replace_gains(
+        msgspec.structs.replace(FLAPPER, control=msgspec.structs.replace(FLAPPER.control, b=b)),
+        "pd",
+        Kp=quotients(tuple(k * lam for k, lam in zip(gains.K, gains.Lambda, strict=True)), b),
+        Kd=quotients(tuple(k + lam for k, lam in zip(gains.K, gains.Lambda, strict=True)), b),
     )
 
 
@@ -58,8 +57,8 @@ def test_with_the_gains_of_flapper_the_two_differ_by_rounding_alone() -> None:
 def test_other_gains_are_another_law(gain: str, factor: float) -> None:
     """The identity above is not for want of a difference."""
     scenario = with_the_gains_of_the_ude()
-    gains = tuple(factor * value for value in getattr(scenario.control, gain))
-    other = msgspec.structs.replace(scenario, control=msgspec.structs.replace(scenario.control, **{gain: gains}))
+    gains = [factor * value for value in getattr(scenario.read_gains("pd", PdGains), gain)]
+    other = replace_gains(scenario, "pd", **{gain: gains})
     assert np.abs(simulate(other, make_law("dob_ff", other)).q - simulate(scenario).q).max() > 1e-5
 
 

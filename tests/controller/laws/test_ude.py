@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from controller.laws.filters import Filters
 from controller.laws.law import make_law
+from controller.laws.ude import UdeGains
 from protocol.messages import FloatArray
 from protocol.scenario import Reference, Scenario, find_scenario, load_scenario
 from tests.contracts.law_contract import WIDE
@@ -61,11 +63,15 @@ def continuous_flight(scenario: Scenario, *, state_feedback: bool, compensate: b
     Output feedback takes v = D q_e with D(s) = N s/(s + N) for q_e'; the Butterworth filter of (18) runs on the true u_d,
     which neither the law nor its realisation ever sees.
     """
-    model, c = scenario.reference, scenario.control
+    model, gains, filters = (
+        scenario.reference,
+        scenario.read_gains("ude", UdeGains),
+        scenario.read_gains("filters", Filters),
+    )
     damping, stiffness, gain, frequency = (
         np.array(part) for part in (model.A_d, model.B_d, model.C_d, model.frequency_rad_s)
     )
-    k, lam, b, n, t_f = (np.array(part) for part in (c.K, c.Lambda, c.b, c.N, c.T))
+    k, lam, b, n, t_f = (np.array(part) for part in (gains.K, gains.Lambda, scenario.control.b, filters.N, filters.T))
 
     def slope(t: float, state: FloatArray) -> FloatArray:
         q, q_dot, q_d, q_d_dot, slow, uhat, uhat_dot = state.reshape(7, 6)
@@ -80,7 +86,7 @@ def continuous_flight(scenario: Scenario, *, state_feedback: bool, compensate: b
 
     q, q_dot = start_motion(scenario)
     q_d, zero = np.array(model.initial), np.zeros(6)
-    start = np.concatenate((q, q_dot, q_d, zero, q - q_d, np.array(c.uhat0), zero))
+    start = np.concatenate((q, q_dot, q_d, zero, q - q_d, np.array(scenario.control.uhat0), zero))
     solution = solve_ivp(slope, (0.0, T_END_S), start, "DOP853", rtol=1e-11, atol=1e-13)
     end: FloatArray = solution.y[:6, -1]
     return end
@@ -116,8 +122,8 @@ def test_without_compensation_the_estimate_stays_what_it_was() -> None:
         assert law.step(other, k * scenario.period_ns, row).tobytes() == tau.tobytes()
         other.applied[:] = 1e-3 * rng.normal(size=6)  # as if the motors had done something else
         if k == 0:
-            c = scenario.control
+            c, gains = scenario.control, scenario.read_gains("ude", UdeGains)
             error = q[0] - np.array(scenario.reference.initial)
             q_d_ddot = -np.array(scenario.reference.B_d) * np.array(scenario.reference.initial)
-            b_tau = q_d_ddot - np.array(c.K) * np.array(c.Lambda) * error - np.array(c.uhat0)
+            b_tau = q_d_ddot - np.array(gains.K) * np.array(gains.Lambda) * error - np.array(c.uhat0)
             assert tau * np.array(c.b) == pytest.approx(b_tau, rel=1e-6, abs=1e-6 * np.abs(b_tau).max())

@@ -23,6 +23,7 @@ from fwav_hil.replay.into_controller import replay_in_process
 from fwav_hil.replay.recorded_run import recorded_run
 from plant_emulator.plant.truth import load_truth
 from protocol.logs.tlog import read_tlog
+from protocol.scenario import replace_gains
 from protocol.wire import parameter_mapping
 from tests.loop import Ends, fly_both, scenario_of
 from tests.plant_emulator.pacing.test_lockstep import Faulty
@@ -91,19 +92,11 @@ def test_the_gain_set_is_the_gain_flown(tmp_path: Path) -> None:
     gain = message(SET(1, 1, b"LAW_K_X", 15.0, parameter_mapping.Kind.REAL32))
     fly_watched(tmp_path / "set", gain, before="PARAM_VALUE")
     near, far = memory_pair()
-    control = {name: list(value) if isinstance(value, tuple) else value for name, value in _control().items()}
-    control["K"] = [15.0, *control["K"][1:]]
     with near, far:
-        fly_both(scenario_of("flapper", duration_s=2.0, control=control), near, far, tmp_path / "made")
+        asked = replace_gains(ROOMY, "ude", K=[15.0, *ROOMY.gains["ude"]["K"][1:]])
+        fly_both(asked, near, far, tmp_path / "made")
     flown, made = (load_truth(tmp_path / name / "ground_truth.npy") for name in ("set", "made"))
     assert np.array_equal(flown["command"], made["command"])
-
-
-def _control() -> dict[str, Any]:
-    import msgspec
-
-    control: dict[str, Any] = msgspec.to_builtins(ROOMY.control)
-    return control
 
 
 def test_nothing_is_set_while_armed() -> None:

@@ -30,6 +30,7 @@ from fwav_hil.studies.design import (
     compare,
     cost,
     flown_error,
+    gain_of,
     gains_of,
     search,
     shortfall,
@@ -137,20 +138,21 @@ class TestSearch:
         ]  # fmt: skip
         assert runs[0].scenario == runs[1].scenario
         assert runs[0].scenario != runs[2].scenario
-        control = runs[0].scenario.control
-        assert np.log([control.K[4], control.Lambda[4], control.T[4], control.N[4]]) == pytest.approx(BETTER, abs=0.7)
+        found = runs[0].scenario
+        assert np.log([gain_of(found, name)[4] for name in NAMES]) == pytest.approx(BETTER, abs=0.7)
         assert heard[0] == "attitude"
         assert heard[-1] == "position"
         # Everything that is not searched for stays.
-        assert control.Kp == scenario.control.Kp
-        assert msgspec.structs.replace(runs[0].scenario, control=scenario.control) == scenario
+        assert found.gains["pd"] == scenario.gains["pd"]
+        assert found.gains["filters"]["order"] == scenario.gains["filters"]["order"]
+        assert msgspec.structs.replace(found, gains=scenario.gains) == scenario
 
     def test_never_loses_the_gains_it_began_with(self) -> None:
         """At the cost of nothing but its own gains the first generation keeps them, to three digits."""
         found = search(
             scenario_of("flapper"), seed=1, flights=1, generations=1, mapping=candidates_instead_of_flights(HAND_TUNED)
         )
-        assert found.scenario.control.K[3] == 40.0
+        assert gain_of(found.scenario, "K")[3] == 40.0
 
     def test_says_so_where_there_are_no_such_gains(self) -> None:
         def hopeless(_: Task) -> Map:
@@ -180,7 +182,7 @@ class TestSearch:
 
     def test_gains_go_to_their_axes_only(self) -> None:
         changed = with_gains(scenario_of("flapper"), (0, 1, 2), ("K",), (7.0,))
-        assert changed.control.K == (7.0, 7.0, 7.0, 40.0, 40.0, 40.0)
+        assert gain_of(changed, "K") == (7.0, 7.0, 7.0, 40.0, 40.0, 40.0)
 
 
 def test_a_stop_is_heard_between_candidates() -> None:
@@ -230,11 +232,11 @@ class TestResult:
         out = tmp_path / "Faster one.toml"
         out.write_text(scenario_text(result, base, out), encoding="utf-8")
         text = out.read_text()
-        assert text.startswith("# K, Lambda, T, N of [control] are designed")
+        assert text.startswith("# K, Lambda, T, N of [gains] are designed")
         assert ("extends = " in text) == beside
         loaded = load_scenario(out)
         assert loaded.name == "flapper_designed"  # the file's name is no scenario's
-        assert loaded.control == result.designed.control
+        assert loaded.gains == result.designed.gains
         expected = msgspec.structs.replace(result.designed, name=loaded.name, description=loaded.description)
         assert loaded == expected
 
@@ -274,7 +276,7 @@ class TestCommand:
             assert (margin.gain_margin or 0.0) >= 2.0, axis
             assert (margin.max_delay_s or 1.0) >= 0.018, axis
         assert set(result["gains"]["position"]) == set(NAMES)
-        assert result["gains"]["attitude"]["K"] == loaded.control.K[3]
+        assert result["gains"]["attitude"]["K"] == gain_of(loaded, "K")[3]
         assert result["improvement"] < 1.02
         assert result["file"] == str(out)
 

@@ -23,7 +23,7 @@ from fwav_hil.studies.flight_check import (
     without_noise,
 )
 from fwav_hil.studies.loop_model import channels, largest_delay
-from protocol.scenario import Play, Scenario
+from protocol.scenario import Play, Scenario, replace_gains
 from tests.loop import scenario_of
 
 
@@ -141,7 +141,7 @@ class TestFlownDelay:
     def test_of_a_slow_derivative_pole_is_none(self) -> None:
         """N = 100 is lost at 1 kHz without any delay."""
         scenario = scenario_of("paper")
-        slow = msgspec.structs.replace(scenario, control=msgspec.structs.replace(scenario.control, N=(100.0,) * 6))
+        slow = replace_gains(scenario, "filters", N=(100.0,) * 6)
         flown = flown_delay(slow, 0.002)
         assert (flown.max_delay_s, flown.lost_delay_s) == (0.0, 0.0)
 

@@ -6,7 +6,6 @@ import math
 import subprocess
 import sys
 from collections.abc import Callable
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -28,13 +27,8 @@ from fwav_hil.studies.loop_model import (
 )
 from protocol.errors import UsageError
 from protocol.messages import AXES
-from protocol.scenario import ZERO6, Actuators, Backlash, Delay, Initial, Noise, Scenario
+from protocol.scenario import ZERO6, Actuators, Backlash, Delay, Initial, Noise, Scenario, replace_gains
 from tests.loop import scenario_of
-
-
-def changed(scenario: Scenario, **control: Any) -> Scenario:
-    copy: Scenario = msgspec.structs.replace(scenario, control=msgspec.structs.replace(scenario.control, **control))
-    return copy
 
 
 def linear_plant(scenario: Scenario, axis: str, ratio: float, delay_s: float) -> Scenario:
@@ -44,7 +38,7 @@ def linear_plant(scenario: Scenario, axis: str, ratio: float, delay_s: float) ->
     offset = np.zeros(6)
     offset[AXES.index(axis)] = 1e-3
     period_s = scenario.period_ns * 1e-9
-    straight: Scenario = msgspec.structs.replace(
+    return msgspec.structs.replace(
         scenario,
         duration_s=3000 * period_s,
         substep_s=period_s,  # Runge-Kutta is exact here: the acceleration is constant between commands
@@ -55,8 +49,8 @@ def linear_plant(scenario: Scenario, axis: str, ratio: float, delay_s: float) ->
         initial=Initial(position=tuple(offset[:3]), attitude=tuple(offset[3:])),
         noise=Noise(),
         delay=Delay(samples=0, seconds=delay_s),
+        control=msgspec.structs.replace(scenario.control, uhat0=ZERO6, rotate_force=False),
     )
-    return changed(straight, uhat0=ZERO6, rotate_force=False)
 
 
 def grows(scenario: Scenario, axis: str) -> bool:
@@ -136,7 +130,8 @@ def test_a_pure_rate_feedback_has_a_closed_form(samples: int, limit: float) -> N
     scenario = scenario_of("paper", law="pd", rate_hz=1000.0)
     rate_gain = 300.0
     b = scenario.control.b
-    scenario = changed(scenario, N=(1e9,) * 6, Kp=tuple(1e-3 / x for x in b), Kd=tuple(rate_gain / x for x in b))
+    scenario = replace_gains(scenario, "filters", N=(1e9,) * 6)
+    scenario = replace_gains(scenario, "pd", Kp=[1e-3 / x for x in b], Kd=[rate_gain / x for x in b])
     for channel in channels(scenario).values():
         top = stable_gains(channel, samples * 1e-3)[-1][1]
         assert top * rate_gain * 1e-3 == pytest.approx(limit, rel=1e-4)
@@ -145,7 +140,7 @@ def test_a_pure_rate_feedback_has_a_closed_form(samples: int, limit: float) -> N
 @pytest.mark.parametrize(("samples", "limit"), [(0, 1.88), (1, 0.80)])
 def test_the_rule_of_thumb_for_the_largest_gain(samples: int, limit: float) -> None:
     """g/b < 1.88/(K Ts), .80/(K Ts) with one sample, for a large N: a rule of thumb, so to 6 % (ours: 1.965 and .816)."""
-    channel = channels(changed(scenario_of("paper"), N=(1e7,) * 6))["x"]
+    channel = channels(replace_gains(scenario_of("paper"), "filters", N=(1e7,) * 6))["x"]
     assert stable_gains(channel, samples * 1e-3)[-1][1] * 500.0 * 1e-3 == pytest.approx(limit, rel=0.06)
 
 

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from controller.laws.filters import Filters
 from fwav_hil.studies.loop_model import channels, gain_ratios
 from fwav_hil.studies.margin import (
     RATES_HZ,
@@ -101,7 +102,8 @@ class TestChanges:
             assert np.array(after.kappa) / after.h == pytest.approx(np.array(before.kappa) / before.h)  # type: ignore[union-attr]
 
     def test_a_derivative_pole_is_that_of_all_channels(self) -> None:
-        assert with_derivative_pole(scenario_of("flapper"), 77.0).control.N == (77.0,) * 6
+        changed = with_derivative_pole(scenario_of("flapper"), 77.0)
+        assert changed.read_gains("filters", Filters).N == (77.0,) * 6
 
     @pytest.mark.parametrize("rate_hz", RATES_HZ)
     def test_every_rate_of_the_table_fits_every_scenario(self, rate_hz: float) -> None:

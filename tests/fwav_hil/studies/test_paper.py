@@ -6,7 +6,6 @@ import json
 from functools import cache
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -29,7 +28,7 @@ from fwav_hil.studies.paper import (
     rows_of,
 )
 from protocol.messages import AXES
-from protocol.scenario import Scenario
+from protocol.scenario import Scenario, replace_gains
 from tests.loop import scenario_of
 
 
@@ -101,8 +100,7 @@ def test_the_bound_is_taken_from_the_run() -> None:
 def test_the_bound_of_a_motion_worked_out_by_hand() -> None:
     """q_e = a e^(-t): q_z = (Lambda - 1) q_e, q_z' = -q_z, u~ = (K - 1) q_z."""
     flight = flights("paper")[2]
-    gains = msgspec.structs.replace(flight.scenario.control, Lambda=(3.0,) * 6, K=(5.0,) * 6)
-    scenario = msgspec.structs.replace(flight.scenario, control=gains)
+    scenario = replace_gains(flight.scenario, "ude", Lambda=(3.0,) * 6, K=(5.0,) * 6)
     t = flight.result.t_ns * 1e-9
     decay = 0.01 * np.exp(-t)[:, None] * np.ones(6)
     desired = reference_trajectory(scenario.reference, len(t), scenario.period_ns)
@@ -118,8 +116,7 @@ def test_the_bound_of_a_motion_worked_out_by_hand() -> None:
 def test_the_comparison_solves_its_equation_for_a_constant_and_is_closer_than_the_bound() -> None:
     """q_e' = -Lambda q_e + c: q_z = c stays, u~ = K c, y -> (K c)^2 / 2 / rho from c^2 / 2."""
     flight = flights("paper")[2]
-    gains = msgspec.structs.replace(flight.scenario.control, Lambda=(3.0,) * 6, K=(5.0,) * 6)
-    scenario = msgspec.structs.replace(flight.scenario, control=gains)
+    scenario = replace_gains(flight.scenario, "ude", Lambda=(3.0,) * 6, K=(5.0,) * 6)
     t = flight.result.t_ns * 1e-9
     error = 0.01 * (1.0 - np.exp(-3.0 * t))[:, None] * np.ones(6)
     rate = 0.03 * np.exp(-3.0 * t)[:, None] * np.ones(6)
