@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 
 from bridge.endpoint import Endpoint, refuse_other_scenario
+from bridge.links.link import counterpart
 from bridge.process import StopFlag
 from bridge.requests import Handler, Requests
 from bridge.timing.clock import Clock
@@ -100,7 +101,7 @@ class HilSession:
             )
         raise PeerMissingError(
             f"no emulator at {uri} within {wait_s:g} s: start one with `fwav-hil emulator SCENARIO "
-            f"--link {uri.replace('out://', 'in://', 1)}`, or wait longer with --wait"
+            f"--link {counterpart(uri)}`, or wait longer with --wait"
         )
 
     def due_frames(self, t_ns: int) -> list[bytes]:

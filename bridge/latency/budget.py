@@ -14,27 +14,18 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from bridge.links.link import LinkUri, parse_link_uri
+from bridge.links.link import BITS_PER_BYTE, LINKS, LinkUri, parse_link_uri
 from protocol.messages import VEHICLE, ActuatorCommand
 from protocol.wire import mapping
 from protocol.wire.codec import FrameWriter, layout
 from protocol.wire.framing import CRC_SIZE, HEADER_V2
 from protocol.wire.streams import STREAMS, End, Stream
 
-BITS_PER_BYTE = 10
-"""On a serial line: start bit, eight data bits, stop bit."""
 USUAL_BAUDS = (57_600, 115_200, 230_400, 460_800, 921_600, 1_500_000, 2_000_000, 3_000_000, 4_000_000)
-ETHERNET_BYTES_PER_S = 12.5e6
-"""Assumed of a network: 100 Mbit/s."""
-LOOPBACK_BYTES_PER_S = 1e9
-"""Assumed of this machine's own memory."""
 ADAPTER_HOLD_S = 0.001
 """What a USB adapter may hold bytes for with the low latency that the link asks for when it is opened."""
 
 _FASTEST_HZ = 10_000_000
-_ETHERNET_FRAME = 38  # preamble 8, addresses and type 14, check 4, gap 12
-_HEADERS = {"udp": _ETHERNET_FRAME + 20 + 8, "tcp": _ETHERNET_FRAME + 20 + 32}
-_LOOPBACK = ("127.", "localhost", "::1")
 _WAYS = (("emulator to controller", End.EMULATOR), ("controller to emulator", End.CONTROLLER))
 
 
@@ -135,8 +126,8 @@ def link_budget(uri: str, rate_hz: float) -> Budget:
 
 def _way(name: str, end: End, link: LinkUri, rate_hz: float) -> Way:
     sent = [row for row in STREAMS if row.sender in (end, End.BOTH) and (row.each_tick or row.rate_hz)]
-    header = _header_bytes(link)
-    capacity = _capacity(link)
+    header = LINKS[link.scheme].header_bytes
+    capacity = LINKS[link.scheme].capacity(link)
 
     def shares_at(hz: float) -> tuple[Share, ...]:
         return tuple(_share(row, hz) for row in sent)
@@ -164,24 +155,10 @@ def _share(row: Stream, rate_hz: float) -> Share:
     return Share(row.message, size, often_hz, size * often_hz)
 
 
-def _is_loopback(link: LinkUri) -> bool:
-    return link.scheme == "mem" or link.host.startswith(_LOOPBACK)
-
-
-def _capacity(link: LinkUri) -> float:
-    if link.scheme == "serial":
-        return link.baud / BITS_PER_BYTE
-    return LOOPBACK_BYTES_PER_S if _is_loopback(link) else ETHERNET_BYTES_PER_S
-
-
-def _header_bytes(link: LinkUri) -> int:
-    return _HEADERS.get(link.scheme[:3], 0)
-
-
 def _hops(link: LinkUri, ways: tuple[Way, ...]) -> tuple[Hop, ...]:
     """What lies between a sample and its command acting, the two processes' own time left out."""
-    capacity = _capacity(link)
-    speed = f"{link.baud} baud" if link.scheme == "serial" else f"{8e-6 * capacity:g} Mbit/s, assumed"
+    capacity = LINKS[link.scheme].capacity(link)
+    speed = f"{link.baud} baud" if link.baud else f"{8e-6 * capacity:g} Mbit/s, assumed"
     tick, command = (
         Hop(what, way.tick_bytes / capacity, f"{way.tick_bytes} bytes at {speed}")
         for what, way in zip(("pose and tick on the wire", "command on the wire"), ways, strict=True)
@@ -211,7 +188,7 @@ def _fits_sentence(uri: str, rate_hz: float, ways: tuple[Way, ...]) -> str:
 def _refusal(link: LinkUri, rate_hz: float, ways: tuple[Way, ...], highest_hz: int) -> str:
     worst = max(ways, key=lambda way: way.share)
     needed = BITS_PER_BYTE * worst.bytes_per_s
-    enough = next((baud for baud in USUAL_BAUDS if baud >= needed), None) if link.scheme == "serial" else None
+    enough = next((baud for baud in USUAL_BAUDS if baud >= needed), None) if link.baud else None
     other = f", or {enough} baud or more" if enough else ""
     if highest_hz >= 1:
         remedy = f"up to {highest_hz} Hz fit, so choose --rate {_usual_rate(highest_hz)}{other}"

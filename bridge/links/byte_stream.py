@@ -24,8 +24,6 @@ class StreamLink(Link):
     A transport says how to read and write without blocking, and what to wait on.
     """
 
-    is_datagram = False
-
     def __init__(self, uri: str, *, send_timeout_s: float = SEND_TIMEOUT_S) -> None:
         """Set up what every stream has; `send_timeout_s` bounds each send."""
         super().__init__(uri)

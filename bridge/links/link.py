@@ -7,16 +7,17 @@
     serial:///dev/ttyUSB0:921600    a serial line             bridge/links/serial_port.py
     mem://loop                      inside this process       bridge/links/memory.py
 
-A further transport is one file, one line in LINKS (and, where its URI has another shape, one in `parse_link_uri`), and
+A further transport is one file, one row in LINKS (and, where its URI has another shape, a medium in `parse_link_uri`), and
 a test class that inherits `tests.contracts.link_contract.LinkContract`.
 """
 
 from __future__ import annotations
 
 import abc
+import enum
 import importlib
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from types import MappingProxyType
 from typing import Final, Protocol, Self, cast
@@ -65,8 +66,6 @@ class Link(abc.ABC):
     A link that wraps another gives its own `stats` and passes the rest on.
     """
 
-    is_datagram: bool
-
     spin_s: float = 0.0
     """Poll for this long before sleeping in `recv`: a core kept busy for a quicker hand-over. UDP only; others ignore it."""
 
@@ -78,6 +77,11 @@ class Link(abc.ABC):
         self.uri = uri
         self.stats = LinkStats()
         self._closed = False
+
+    @property
+    def is_datagram(self) -> bool:
+        """Whether the link keeps the bounds of what was sent."""
+        return scheme_of(self.uri).is_datagram
 
     @abc.abstractmethod
     def recv(self, timeout_s: float) -> bytes | None:
@@ -160,20 +164,86 @@ class _Opener(Protocol):
     def __call__(self, uri: LinkUri, *, connect_timeout_s: float) -> Link: ...
 
 
-LINKS: Final[Mapping[str, str]] = MappingProxyType(
+class Medium(enum.Enum):
+    """What carries a link."""
+
+    NETWORK = "network"
+    SERIAL = "serial line"
+    MEMORY = "this process"
+
+
+@dataclass(frozen=True, slots=True)
+class Scheme:
+    """What is known of all links of one scheme.
+
+    opener        "module:callable", which takes a LinkUri and connect_timeout_s; imported when a link is first opened
+    capacity      bytes a second one way, assumed where they are not a matter of the URI
+    is_datagram   see `Link`
+    counterpart   scheme of the other end's URI, which is the same but for that
+    waits         whether this end waits for the other one to come, so that it needs no address of it
+    header_bytes  that each datagram or segment costs besides
+    port          proposed in messages
+    """
+
+    opener: str
+    medium: Medium
+    capacity: Callable[[LinkUri], float]
+    is_datagram: bool
+    counterpart: str
+    waits: bool = False
+    header_bytes: int = 0
+    port: int = 0
+
+
+BITS_PER_BYTE = 10
+"""On a serial line: start bit, eight data bits, stop bit."""
+ETHERNET_BYTES_PER_S = 12.5e6
+"""Assumed of a network: 100 Mbit/s."""
+MEMORY_BYTES_PER_S = 1e9
+"""Assumed of this machine's own memory."""
+_LOOPBACK = ("127.", "localhost", "::1")
+_ETHERNET_FRAME = 38  # preamble 8, addresses and type 14, check 4, gap 12
+
+
+def _of_network(uri: LinkUri) -> float:
+    return MEMORY_BYTES_PER_S if uri.host.startswith(_LOOPBACK) else ETHERNET_BYTES_PER_S
+
+
+def _udp(opener: str, counterpart: str, *, waits: bool) -> Scheme:
+    headers = _ETHERNET_FRAME + 20 + 8
+    return Scheme(opener, Medium.NETWORK, _of_network, True, counterpart, waits, headers, port=14560)
+
+
+def _tcp(opener: str, counterpart: str, *, waits: bool) -> Scheme:
+    headers = _ETHERNET_FRAME + 20 + 32
+    return Scheme(opener, Medium.NETWORK, _of_network, False, counterpart, waits, headers, port=4560)
+
+
+LINKS: Final[Mapping[str, Scheme]] = MappingProxyType(
     {
-        "udpin": "bridge.links.udp:UdpIn",
-        "udpout": "bridge.links.udp:UdpOut",
-        "tcpin": "bridge.links.tcp:TcpIn",
-        "tcpout": "bridge.links.tcp:TcpOut",
-        "serial": "bridge.links.serial_port:SerialLink",
-        "mem": "bridge.links.memory:open_memory",
+        "udpin": _udp("bridge.links.udp:UdpIn", "udpout", waits=True),
+        "udpout": _udp("bridge.links.udp:UdpOut", "udpin", waits=False),
+        "tcpin": _tcp("bridge.links.tcp:TcpIn", "tcpout", waits=True),
+        "tcpout": _tcp("bridge.links.tcp:TcpOut", "tcpin", waits=False),
+        "serial": Scheme(
+            "bridge.links.serial_port:SerialLink",
+            Medium.SERIAL,
+            lambda uri: uri.baud / BITS_PER_BYTE,
+            is_datagram=False,
+            counterpart="serial",
+        ),
+        "mem": Scheme(
+            "bridge.links.memory:open_memory",
+            Medium.MEMORY,
+            lambda _: MEMORY_BYTES_PER_S,
+            is_datagram=True,
+            counterpart="mem",
+        ),
     }
 )
-"""Scheme -> "module:callable"; the callable takes a LinkUri and connect_timeout_s. Imported when first opened."""
 
 _DEFAULT_HOST = "127.0.0.1"  # never all interfaces unless asked: who reaches the port can move the vehicle
-_PROPOSED_PORT = {"udp": 14560, "tcp": 4560}
+_PROPOSED_LINK = "udpin://127.0.0.1:14560"
 _PROPOSED_SERIAL = "serial:///dev/ttyUSB0:921600"
 _HOST_AND_PORT = re.compile(r"(?:\[(?P<ipv6>[^\[\]\s]+)\]|(?P<host>[^\[\]:/@?#\s]*))(?::(?P<port>[^:]*))?")
 _LARGEST_PORT = 65535
@@ -192,7 +262,7 @@ def open_link(uri: str, *, connect_timeout_s: float = 10.0) -> Link:
         PeerMissingError: nothing listens at a `tcpout` address.
     """
     parsed = parse_link_uri(uri)
-    module, _, name = LINKS[parsed.scheme].partition(":")
+    module, _, name = LINKS[parsed.scheme].opener.partition(":")
     opener = cast(_Opener, getattr(importlib.import_module(module), name))
     return opener(parsed, connect_timeout_s=connect_timeout_s)
 
@@ -203,17 +273,32 @@ def parse_link_uri(text: str) -> LinkUri:
     Raises:
         LinkUriError: the URI names no link; the message says why and shows one that does.
     """
-    scheme, separator, rest = text.partition("://")
-    if not separator or scheme not in LINKS:
-        schemes = ", ".join(f"{known}://" for known in LINKS)
-        raise _bad(text, f"it must begin with one of {schemes}", f"udpin://{_DEFAULT_HOST}:{_PROPOSED_PORT['udp']}")
-    if scheme == "serial":
+    scheme, _, rest = text.partition("://")
+    medium = scheme_of(text).medium
+    if medium is Medium.SERIAL:
         return _parse_serial(text, rest)
-    if scheme == "mem":
+    if medium is Medium.MEMORY:
         if not re.fullmatch(r"[\w.-]+", rest):
             raise _bad(text, "the name must be of letters, digits, '.', '_' and '-'", "mem://loop")
         return LinkUri(text, scheme, name=rest)
     return _parse_network(text, scheme, rest)
+
+
+def scheme_of(text: str) -> Scheme:
+    """The row of a link URI's scheme. Raises LinkUriError where there is none."""
+    scheme, separator, _ = text.partition("://")
+    if not separator or scheme not in LINKS:
+        schemes = ", ".join(f"{known}://" for known in LINKS)
+        raise _bad(text, f"it must begin with one of {schemes}", _PROPOSED_LINK)
+    return LINKS[scheme]
+
+
+def counterpart(text: str) -> str:
+    """The URI by which the other end of a link opens it; of a serial line, whose device has another name there, its form.
+
+    Raises LinkUriError.
+    """
+    return f"{scheme_of(text).counterpart}://{text.partition('://')[2]}"
 
 
 def _parse_serial(text: str, rest: str) -> LinkUri:
@@ -226,7 +311,7 @@ def _parse_serial(text: str, rest: str) -> LinkUri:
 
 
 def _parse_network(text: str, scheme: str, rest: str) -> LinkUri:
-    proposed = _PROPOSED_PORT[scheme[:3]]
+    proposed = LINKS[scheme].port
     parts = _HOST_AND_PORT.fullmatch(rest)
     if parts is None:
         reason = "it must be a host, ':' and a port, an IPv6 address in brackets"
@@ -238,7 +323,7 @@ def _parse_network(text: str, scheme: str, rest: str) -> LinkUri:
         raise _bad(text, "the port is missing", example)
     if not _is_number(port) or len(port) > _LARGEST_PORT_DIGITS or int(port) > _LARGEST_PORT:
         raise _bad(text, f"the port {port!r} is not a whole number up to {_LARGEST_PORT}", example)
-    if int(port) == 0 and scheme.endswith("out"):
+    if int(port) == 0 and not LINKS[scheme].waits:
         raise _bad(text, "port 0 (the system chooses) makes sense only where a link waits for its peer", example)
     return LinkUri(text, scheme, host=host, port=int(port))
 

@@ -69,8 +69,6 @@ class MemoryLink(Link):
     close of the other end `recv` returns what is still waiting, then raises LinkClosedError.
     """
 
-    is_datagram = True
-
     def __init__(self, wire: _Wire, end: int) -> None:
         """End 0 (the first opened) or 1 of a wire."""
         super().__init__(f"mem://{wire.name or _PAIR}")

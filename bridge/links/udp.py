@@ -41,8 +41,6 @@ _DROPS_PER_RECV = 1000  # strangers' datagrams that one recv clears away once it
 
 
 class _UdpLink(Link):
-    is_datagram = True
-
     def __init__(self, uri: LinkUri, family: socket.AddressFamily) -> None:
         super().__init__(uri.text)
         self._clock = MonotonicClock()

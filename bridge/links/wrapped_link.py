@@ -10,9 +10,13 @@ class WrappedLink(Link):
 
     def __init__(self, link: Link) -> None:
         super().__init__(link.uri)
-        self.is_datagram = link.is_datagram
         self.stats = link.stats
         self._link = link
+
+    @property
+    def is_datagram(self) -> bool:
+        """The link's."""
+        return self._link.is_datagram
 
     @property
     def spin_s(self) -> float:

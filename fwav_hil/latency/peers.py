@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from bridge.endpoint import Endpoint
 from bridge.latency.probes import ProbeResult, probe
-from bridge.links.link import Link, open_link
+from bridge.links.link import Link, counterpart, open_link
 from bridge.process import StopFlag
 from bridge.timing.clock import MonotonicClock
 from bridge.timing.timesync import Estimate, TimeSync
@@ -84,7 +84,7 @@ def probe_responder(stop: StopFlag, *, rate_hz: float, count: int, told: Told) -
     """TIMESYNC between two processes of ours over UDP."""
     with (
         _child("bridge.latency.responder", "udpin://127.0.0.1:0") as said,
-        open_link(said.replace("udpin", "udpout")) as link,
+        open_link(counterpart(said)) as link,
     ):
         link.stamp_receives()
         return probe_time_sync(link, stop, rate_hz=rate_hz, count=count, told=told)[0]

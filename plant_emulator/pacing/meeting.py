@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bridge.endpoint import Endpoint, refuse_other_scenario
+from bridge.links.link import counterpart
 from bridge.process import StopFlag
 from bridge.timing.clock import MonotonicClock
 from plant_emulator.tick import Emulator
@@ -60,7 +61,7 @@ def meet_controller(
         )
     raise PeerMissingError(
         f"no controller came to {uri} within {wait_s:g} s: start one with `fwav-hil controller "
-        f"SCENARIO --link {uri.replace('in://', 'out://', 1)}`, or wait longer with --wait"
+        f"SCENARIO --link {counterpart(uri)}`, or wait longer with --wait"
     )
 
 

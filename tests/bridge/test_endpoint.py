@@ -8,7 +8,7 @@ import pytest
 
 from bridge.endpoint import Endpoint, refuse_other_scenario
 from bridge.links.link import Link
-from bridge.links.memory import memory_pair
+from bridge.links.memory import MemoryLink, memory_pair
 from protocol.errors import LinkClosedError, ScenarioMismatchError
 from protocol.messages import VEHICLE
 from protocol.wire.codec import layout
@@ -96,9 +96,9 @@ def test_sequence_numbers_count_once_they_are_restarted(pair: tuple[Endpoint, En
     assert emulator.counters()["sequence_gaps"] == 2
 
 
-def test_a_frame_that_a_stream_cuts_in_two_is_put_together() -> None:
+def test_a_frame_that_a_stream_cuts_in_two_is_put_together(monkeypatch: pytest.MonkeyPatch) -> None:
     near, far = memory_pair()
-    far.is_datagram = False
+    monkeypatch.setattr(MemoryLink, "is_datagram", False)
     with near, far:
         vehicle, emulator = Endpoint(near, *VEHICLE), Endpoint(far, *EMULATOR)
         frame = vehicle.seal(STATUSTEXT, WORDS)

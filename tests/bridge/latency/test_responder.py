@@ -14,7 +14,7 @@ import pytest
 import bridge
 from bridge.endpoint import Endpoint
 from bridge.latency.responder import main, respond
-from bridge.links.link import open_link
+from bridge.links.link import counterpart, open_link
 from bridge.links.memory import memory_pair
 from bridge.process import StopFlag
 from bridge.timing.clock import MonotonicClock
@@ -66,7 +66,7 @@ def test_as_a_process_it_names_its_link_answers_and_ends_when_told() -> None:
         assert process.stdout is not None
         uri = process.stdout.readline().strip()
         clock = MonotonicClock()
-        with open_link(uri.replace("udpin", "udpout")) as link:
+        with open_link(counterpart(uri)) as link:
             station = Endpoint(link, *STATION)
             sync = TimeSync(station.seal, clock)
             station.send([sync.question()])

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.links.faults import DelayedLink
-from bridge.links.link import Link, open_link
+from bridge.links.link import Link, counterpart, open_link
 from bridge.links.memory import memory_pair
 from bridge.links.udp import UdpIn
 from bridge.timing.clock import MonotonicClock, VirtualClock
@@ -203,7 +203,7 @@ def test_sends_are_not_delayed_and_the_rest_is_the_links() -> None:
 
 
 def test_a_stream_keeps_its_bytes_and_their_order() -> None:
-    with open_link("tcpin://127.0.0.1:0") as server, open_link(server.uri.replace("in://", "out://")) as client:
+    with open_link("tcpin://127.0.0.1:0") as server, open_link(counterpart(server.uri)) as client:
         delayed = DelayedLink(server, 2 * MS, MonotonicClock())
         sent = [bytes([number]) * 300 for number in range(50)]
         for frame in sent:
@@ -235,7 +235,7 @@ def test_on_a_stream_the_next_peer_may_come_after_one_that_hung_up() -> None:
     with open_link("tcpin://127.0.0.1:0") as server:
         delayed = DelayedLink(server, MS, MonotonicClock())
         for word in (b"first", b"second"):
-            with open_link(server.uri.replace("in://", "out://")) as client:
+            with open_link(counterpart(server.uri)) as client:
                 client.send(word)
                 assert receive(delayed) == word
                 client.send(b"never taken")

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.links.link import LINKS, LinkStats, LinkUri, open_link, parse_link_uri
+from bridge.links.link import LINKS, LinkStats, LinkUri, Medium, counterpart, open_link, parse_link_uri
 from protocol.errors import LinkUriError
 
 GOOD = {
@@ -102,10 +102,46 @@ def test_any_text_parses_or_is_a_bad_uri(scheme: str, separator: str, rest: str)
         assert parsed.scheme == scheme
 
 
-def test_the_registry_names_what_is_there() -> None:
-    for target in LINKS.values():
-        module, _, name = target.partition(":")
-        assert callable(getattr(importlib.import_module(module), name))
+class TestRegistry:
+    def test_it_names_what_is_there(self) -> None:
+        for scheme in LINKS.values():
+            module, _, name = scheme.opener.partition(":")
+            assert callable(getattr(importlib.import_module(module), name))
+
+    def test_the_counterpart_of_a_counterpart_is_the_scheme_itself(self) -> None:
+        for name, scheme in LINKS.items():
+            other = LINKS[scheme.counterpart]
+            assert other.counterpart == name
+            assert (other.medium, other.is_datagram, other.header_bytes) == (
+                scheme.medium, scheme.is_datagram, scheme.header_bytes
+            )  # fmt: skip
+            assert not (scheme.waits and other.waits), "nobody would come"
+
+    @pytest.mark.parametrize(
+        ("uri", "other"),
+        [
+            ("udpin://[::1]:14560", "udpout://[::1]:14560"),
+            ("tcpout://127.0.0.1:4560", "tcpin://127.0.0.1:4560"),
+            ("mem://loop", "mem://loop"),
+            ("serial:///dev/ttyUSB0:921600", "serial:///dev/ttyUSB0:921600"),
+        ],
+    )
+    def test_the_other_end_of_a_link(self, uri: str, other: str) -> None:
+        assert counterpart(uri) == other
+
+    def test_only_who_waits_may_leave_the_port_to_the_system(self) -> None:
+        for name, scheme in LINKS.items():
+            if scheme.medium is Medium.NETWORK:
+                uri = f"{name}://127.0.0.1:0"
+                if scheme.waits:
+                    assert parse_link_uri(uri).port == 0
+                else:
+                    with pytest.raises(LinkUriError, match="port 0"):
+                        parse_link_uri(uri)
+
+    def test_no_link_has_no_counterpart(self) -> None:
+        with pytest.raises(LinkUriError, match="must begin with"):
+            counterpart("smoke://signals")
 
 
 def test_no_transport_is_imported_before_it_is_opened() -> None:

@@ -12,7 +12,7 @@ import pytest
 from dronecan.driver.mavcan import MAVCAN
 from pymavlink.dialects.v20 import common
 
-from bridge.links.link import Link, open_link, parse_link_uri
+from bridge.links.link import Link, counterpart, open_link, parse_link_uri
 from bridge.links.memory import memory_pair
 from bridge.links.udp import UdpIn
 from bridge.motor_bus.can_bus import CanBus
@@ -152,7 +152,7 @@ def test_when_a_station_has_left_another_may_come(scheme: str) -> None:
     with open_link(f"{scheme}in://127.0.0.1:0") as link:
         tap = CanTap(link, 191, clock)
         for _ in range(2):
-            with open_link(link.uri.replace("in://", "out://")) as station:
+            with open_link(counterpart(link.uri)) as station:
                 station.send(request)
                 while not tap.forwarding:
                     tap.poll()
