@@ -9,17 +9,19 @@ import json
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 import msgspec
 import numpy as np
 
 from bridge.motor_bus.can_load import plan_bus
-from fwav_hil.run import MotorsOnCan, RunFailedError, RunOptions, run
+from fwav_hil.options import RunOptions
+from fwav_hil.run import RunFailedError, run
 from fwav_hil.run_folder import new_folder
 from fwav_hil.score import scores
 from fwav_hil.simulate import simulate
+from plant_emulator.options import EmulatorOptions, MotorLink
 from protocol.messages import AXES
 from protocol.scenario import Scenario, find_scenario, load_scenario, with_overrides
 
@@ -35,12 +37,11 @@ def flapper(**motor: Any) -> Scenario:
     return with_overrides(scenario, duration_s=4.0, motor=msgspec.to_builtins(scenario.motor) | motor)
 
 
-def fly(scenario: Scenario, feedback: str = "sync") -> list[float] | None:
+def fly(scenario: Scenario, feedback: Literal["sync", "bus"] = "sync") -> list[float] | None:
     """Settled RMSE by axis (m, rad); None where the flight diverged."""
     with tempfile.TemporaryDirectory() as place:
-        options = RunOptions(
-            link="udpin://127.0.0.1:0", show_progress=False, motors=MotorsOnCan(can="virtual:study", feedback=feedback)
-        )
+        emulator = EmulatorOptions(motor="can", bus=MotorLink(can="virtual:study", feedback=feedback))
+        options = RunOptions(link="udpin://127.0.0.1:0", show_progress=False, emulator=emulator)
         try:
             summary = run(scenario, new_folder(scenario, Path(place) / "run"), options)
         except RunFailedError as error:

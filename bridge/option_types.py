@@ -1,13 +1,20 @@
-"""Numbers on a command line: finite ones, and the speed of a run."""
+"""What an option of a command line can be given, beside plain texts and numbers; and the speed of a run."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+import re
+from pathlib import Path
+from typing import Any, ClassVar
 
 import click
 
 from protocol.errors import UsageError
+
+FILE = click.Path(dir_okay=False, path_type=Path)
+FOLDER = click.Path(file_okay=False, path_type=Path)
+EXISTING = click.Path(exists=True, path_type=Path)
+EXISTING_FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 
 SLOWEST_TICK_S = 1.0
 """Of wall time: an end that hears nothing for 3 s takes the other for gone, and drives their host after 2 s."""
@@ -24,10 +31,46 @@ class FiniteRange(click.FloatRange):
         return number
 
 
-speed_option = click.option(
-    "--speed", type=FiniteRange(min=0.001), metavar="X",
-    help="Pace lockstep to X times real time; without it, as fast as it goes.",
-)  # fmt: skip
+class DurationNs(click.ParamType[int]):
+    """A time with its unit, such as 5ms, 250us or 0.1s, up to a second as a scenario's delay; gives whole nanoseconds."""
+
+    name = "time"
+    _UNITS: ClassVar[dict[str, float]] = {"ns": 1.0, "us": 1e3, "ms": 1e6, "s": 1e9}
+    _LONGEST_NS = 1_000_000_000
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Nanoseconds of a text, or fail with the sentence that names the remedy."""
+        if isinstance(value, int):
+            return value
+        match = re.fullmatch(r"(\d+\.?\d*|\.\d+)(ns|us|ms|s)", value.strip(), re.ASCII)
+        if not match:
+            self.fail(f"{value!r} is no time: write a number and its unit, such as 5ms, 250us or 0.1s", param, ctx)
+        time_ns = float(match[1]) * self._UNITS[match[2]]
+        if time_ns > self._LONGEST_NS:
+            self.fail(f"{value!r} is more than a second, with which nothing flies: write a shorter time", param, ctx)
+        return round(time_ns)
+
+
+class MicrosecondsAsS(click.IntRange):
+    """Whole microseconds, not negative; gives seconds."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Seconds of a text, or fail."""
+        return super().convert(value, param, ctx) * 1e-6
+
+
+class KeyFile(click.Path):
+    """A file with a signing key; gives the key. Raises UsageError where it holds none."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The 32 bytes in the file."""
+        from protocol.wire.signing import read_key
+
+        return read_key(Path(str(super().convert(value, param, ctx))))
+
+
+MICROSECONDS = MicrosecondsAsS(min=0)
+KEY_FILE = KeyFile(dir_okay=False)
 
 
 def check_speed(clock: str, speed: float | None, rate_hz: float) -> None:

@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated, Literal, TypeAlias
 
-import msgspec
+from bridge.options import Option
+from bridge.shared_options import DEFAULT_CONTROLLER_LINK, EndOptions, Station, folder_option
+
+Trigger: TypeAlias = Literal["sample", "clock"]
 
 
-class ControllerOptions(msgspec.Struct, frozen=True, kw_only=True):
+class ControllerOptions(EndOptions, frozen=True, kw_only=True):
     """How the process runs.
 
-    link: a URI, or `-` to read it from standard input once everything is ready. legs: real time: note when each sample
-    and command was where. trigger: in real time, `sample` or `clock`. realtime, core: ask for what `bridge.timing.realtime`
-    lists. spin_s: in lockstep see `Link.spin_s` (None: 0); in real time how long to poll before a sample or deadline is due
-    (None: as measured with `realtime`, else 0). station: URI of a ground station's link. key: of
-    signatures on the loop's link.
+    link: a URI, or `-` to read it from standard input once everything is ready. core: the one to have with `realtime`.
     """
 
-    link: str
-    clock: str = "lockstep"
-    arm: bool = True
-    out: Path | None = None
-    wait_s: float = 30.0
-    spin_s: float | None = None
-    legs: bool = False
-    trigger: str = "sample"
-    realtime: bool = False
+    link: Annotated[str, Option(
+        "--link", "Where the emulator is: udpout://, udpin://, tcpout://, tcpin://, serial:///dev/x:baud.", "URI"
+    )] = DEFAULT_CONTROLLER_LINK  # fmt: skip
+    trigger: Annotated[Trigger, Option(
+        "--trigger",
+        "With --clock realtime the controller steps on each sample as it comes, or on a clock of its own with the "
+        "newest one."
+    )] = "sample"  # fmt: skip
+    arm: Annotated[bool, Option(
+        "--arm/--no-arm",
+        "Arm as soon as the emulator shows the same scenario, or wait for MAV_CMD_COMPONENT_ARM_DISARM."
+    )] = True  # fmt: skip
+    station: Station = None
+    out: Annotated[Path | None, folder_option("Folder for the counters.")] = None
     core: int | None = None
-    station: str | None = None
-    key: bytes | None = None

@@ -19,7 +19,6 @@ from protocol.wire import mapping
 from protocol.wire.codec import Frame, FrameWriter
 from protocol.wire.schedule import Encoder, Saying
 
-
 _SAMPLE, _AGAIN = Found.SAMPLE, Found.AGAIN
 
 

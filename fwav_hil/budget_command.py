@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import click
 
-from bridge.command_line import chosen_scenario, json_option, options, rate_option, scenario_argument
+from bridge.options import Except, Option, command
+from bridge.shared_options import JsonPath, ScenarioChoice
 from bridge.summary import is_stdout, show_json
 from protocol.errors import UsageError
 
@@ -15,16 +15,12 @@ if TYPE_CHECKING:
     from bridge.latency.budget import Budget
 
 
-@click.command("budget", epilog="\b\nExample:\n  fwav-hil budget --link serial:///dev/ttyUSB0:921600 --rate 500")
-@options(
-    scenario_argument,
-    click.option(
-        "--link", required=True, metavar="URI", help="The link, at either end: serial://, udpin://, tcpout:// ..."
-    ),
-    rate_option,
-    json_option,
-)  # fmt: skip
-def budget(scenario: str, link: str, rate: float | None, json_path: Path | None) -> None:
+@command("budget", "fwav-hil budget --link serial:///dev/ttyUSB0:921600 --rate 500")
+def budget(
+    choice: Annotated[ScenarioChoice, Except("law", "duration_s", "seed")],
+    link: Annotated[str, Option("--link", "The link, at either end: serial://, udpin://, tcpout:// ...", "URI")],
+    json_path: JsonPath = None,
+) -> None:
     """Say whether SCENARIO's messages fit a link at a rate, and what each hop of the loop adds to the delay.
 
     Nothing is opened. `emulator` and `controller` ask the same before they keep wall time on a serial line.
@@ -32,13 +28,13 @@ def budget(scenario: str, link: str, rate: float | None, json_path: Path | None)
     \b
     Exit code: 0 where the rate fits, else 2.
     """
-    chosen = chosen_scenario(scenario, rate_hz=rate)
+    scenario = choice.load()
     from bridge.latency.budget import link_budget
 
-    found = link_budget(link, chosen.rate_hz)
-    planned_s = chosen.delay_ns * 1e-9
+    found = link_budget(link, scenario.rate_hz)
+    planned_s = scenario.delay_ns * 1e-9
     _print(found, planned_s, to_stderr=is_stdout(json_path))
-    show_json(json_path, {"budget": found, "scenario": chosen.name, "scenario_delay_s": planned_s})
+    show_json(json_path, {"budget": found, "scenario": scenario.name, "scenario_delay_s": planned_s})
     if not found.fits:
         raise UsageError(found.sentence)
     click.echo(found.sentence, err=is_stdout(json_path))

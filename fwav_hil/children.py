@@ -12,29 +12,27 @@ from typing import Any
 
 import msgspec
 
+from fwav_hil.jobs import Job
 from protocol.errors import Interrupted
 
 _GRACE_S = 5.0
 
 
 class Child:
-    """A process of the project that reports one JSON object a line on its standard output.
+    """A process that does a job (`fwav_hil/jobs.py`) and reports one JSON object a line on its standard output.
 
-    name   what it is called in messages, and calls itself on standard error; by default the module
+    name   which process, one of `jobs.PROCESSES`: as it is called in messages, and calls itself on standard error
     """
 
-    def __init__(self, module: str, arguments: list[str], name: str | None = None) -> None:
-        self.module = module
-        self.name = name or module
+    def __init__(self, name: str, job: Job[Any], module: str = "fwav_hil.jobs") -> None:
+        self.name = name
         self.process = subprocess.Popen(
-            [sys.executable, "-m", module, *arguments, "--status", "jsonl", "--with-parent"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            [sys.executable, "-m", module, name], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )
         self.error = ""
         self._asked = False
         self._partial = b""
+        self.tell(job.encode())
 
     @property
     def failure(self) -> str | None:

@@ -7,37 +7,17 @@ import importlib
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 import click
 
-from bridge.command_line import (
-    DEFAULT_PORT,
-    chosen_scenario,
-    clock_option,
-    delay_option,
-    duration_option,
-    json_option,
-    law_option,
-    legs_option,
-    log_error_option,
-    options,
-    rate_option,
-    realtime_option,
-    scenario_argument,
-    seed_option,
-    signing_key_of,
-    signing_option,
-    spin_option,
-    station_option,
-    trigger_option,
-    truth_option,
-    wait_option,
-)
-from bridge.option_types import check_speed, speed_option
+from bridge.option_types import EXISTING_FOLDER, check_speed
+from bridge.options import Argument, Option, command
+from bridge.shared_options import JsonPath, Plots, ScenarioChoice, folder_option
 from bridge.summary import is_stdout, show_json
 from fwav_hil import __version__
-from plant_emulator.drives.motor_options import chosen_motor_scenario, run_motor_options
+from fwav_hil.options import RunFolder, RunOptions
+from plant_emulator.options import MotorScenarioChoice
 
 COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
@@ -103,119 +83,43 @@ def cli() -> None:
     """
 
 
-out_option = click.option(
-    "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
-    help="Folder of the run; by default a new one in runs/.",
-)  # fmt: skip
-plots_option = click.option("--plots/--no-plots", default=True, show_default=True, help="Draw the plots (PNG).")
-
-
-@click.command(
-    "run", epilog="\b\nExample:\n  fwav-hil run scenarios/flapper.toml --law ude --clock lockstep --json result.json"
-)
-@options(
-    scenario_argument,
-    law_option,
-    clock_option,
-    speed_option,
-    realtime_option,
-    trigger_option,
-    spin_option,
-    rate_option,
-    duration_option,
-    seed_option,
-    click.option(
-        "--link", default=f"udpin://127.0.0.1:{DEFAULT_PORT}", show_default=True, metavar="URI",
-        help="The emulator's end of the link: udpin:// or tcpin://; port 0 takes a free one.",
-    ),
-    delay_option,
-    legs_option,
-    run_motor_options,
-    truth_option,
-    station_option,
-    signing_option,
-    click.option(
-        "--emulator-station", metavar="URI",
-        help="A ground station's link to the emulator: the true state and the drives' speed, on request (docs/station.md).",
-    ),
-    wait_option,
-    out_option,
-    log_error_option,
-    plots_option,
-    json_option,
-)  # fmt: skip
+@command("run", "fwav-hil run scenarios/flapper.toml --law ude --clock lockstep --json result.json")
 def run_command(
-    scenario: str,
-    law: str | None,
-    clock: str,
-    speed: float | None,
-    realtime: bool,
-    trigger: str,
-    spin_us: int | None,
-    rate: float | None,
-    duration: float | None,
-    seed: int | None,
-    link: str,
-    delay_ns: int,
-    legs: bool,
-    motor: str,
-    can: str,
-    protocol: str | None,
-    lag: float | None,
-    feedback: str,
-    can_log: Path | None,
-    tap: str | None,
-    truth_hz: float | None,
-    station: str | None,
-    signing_key: Path | None,
-    emulator_station: str | None,
-    wait_s: float,
-    out: Path | None,
-    on_log_error: str,
-    plots: bool,
-    json_path: Path | None,
+    choice: MotorScenarioChoice,
+    options: RunOptions,
+    out: RunFolder = None,
+    plots: Plots = True,
+    json_path: JsonPath = None,
 ) -> None:
     """Fly SCENARIO with the emulator and the controller as two processes that speak MAVLink over a link.
 
     With --motor can the drives are a third one, on a CAN bus.
     """
-    chosen = chosen_motor_scenario(
-        scenario, protocol=protocol, lag_s=lag, rate_hz=rate, duration_s=duration, seed=seed, law=law
-    )
+    scenario = choice.load()
     from bridge.command_line import refuse_rate_that_cannot_fit
     from bridge.timing.realtime import check_real_time
     from controller.laws.registry import refuse_on_a_link
     from fwav_hil.compile import compile_kernels
-    from fwav_hil.run import MotorsOnCan, RunOptions, check_link, run
+    from fwav_hil.run import check_link, check_motors, run
     from fwav_hil.run_folder import new_folder
     from protocol.errors import FwavHilError, UsageError
-    from protocol.scenario import find_scenario
 
-    refuse_on_a_link(chosen, find_scenario(scenario))
-    check_real_time(clock, realtime=realtime, trigger=trigger)
-    check_speed(clock, speed, chosen.rate_hz)
-    check_link(link)
-    signing_key_of(signing_key)  # a wrong one is said before anything is started
-    if clock == "realtime":
-        refuse_rate_that_cannot_fit(link, chosen.rate_hz)
-    if clock != "realtime" and (delay_ns or legs):
+    refuse_on_a_link(scenario, choice.path)
+    check_real_time(options.clock, realtime=options.realtime, trigger=options.controller.trigger)
+    check_speed(options.clock, options.emulator.speed, scenario.rate_hz)
+    check_link(options.link)
+    if options.clock == "realtime":
+        refuse_rate_that_cannot_fit(options.link, scenario.rate_hz)
+    elif options.emulator.delay_ns or options.legs:
         raise UsageError(
             "--delay and --legs are of real time: add --clock realtime (in lockstep the scenario's [delay] is)"
         )
-    motors = MotorsOnCan(can=can, feedback=feedback, log=can_log, tap=tap) if motor == "can" else None
-    if motors:
-        from fwav_hil.run import check_motors
-
-        check_motors(chosen, motors)
-    compile_kernels(chosen)
-    folder = new_folder(chosen, out)
+    if options.emulator.motors:
+        check_motors(scenario, options.emulator.motors)
+    compile_kernels(scenario)
+    folder = new_folder(scenario, out)
     try:
-        run_options = RunOptions(
-            clock=clock, link=link, speed=speed, wait_s=wait_s, delay_ns=delay_ns, legs=legs, on_log_error=on_log_error,
-            motors=motors, realtime=realtime, trigger=trigger, spin_us=spin_us, truth_hz=truth_hz,
-            station=station, signing_key=signing_key, emulator_station=emulator_station,
-        )  # fmt: skip
-        run(chosen, folder, run_options)
+        run(scenario, folder, options)
     except FwavHilError:
         # The run's own error is the one to end with, whatever else its folder gives trouble with.
         with contextlib.suppress(FwavHilError):
@@ -224,53 +128,38 @@ def run_command(
     _finish(folder, json_path, plots=plots)
 
 
-@click.command("simulate", epilog="\b\nExample:\n  fwav-hil simulate flapper --rate 500 --seeds 20 --json spread.json")
-@options(
-    scenario_argument,
-    law_option,
-    rate_option,
-    duration_option,
-    seed_option,
-    click.option(
-        "--seeds", type=click.IntRange(min=1), metavar="N", help="Fly N seeds from the first on and show the spread.",
-    ),
-    click.option(
-        "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
-        help="Folder for the ground truth, the summary and the plots; nothing is written without it.",
-    ),
-    plots_option,
-    json_option,
-)  # fmt: skip
+@command("simulate", "fwav-hil simulate flapper --rate 500 --seeds 20 --json spread.json")
 def simulate_command(
-    scenario: str,
-    law: str | None,
-    rate: float | None,
-    duration: float | None,
-    seed: int | None,
-    seeds: int | None,
-    out: Path | None,
-    plots: bool,
-    json_path: Path | None,
+    choice: ScenarioChoice,
+    seeds: Annotated[
+        int | None, Option("--seeds", "Fly N seeds from the first on and show the spread.", "N", min=1)
+    ] = None,
+    out: Annotated[
+        Path | None,
+        folder_option("Folder for the ground truth, the summary and the plots; nothing is written without it."),
+    ] = None,
+    plots: Plots = True,
+    json_path: JsonPath = None,
 ) -> None:
     """Fly SCENARIO in this process: the same laws, plant, sampling, delays and noise, compiled, without a link."""
-    chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
+    scenario = choice.load()
     from controller.laws.registry import check_law
     from fwav_hil.run_folder import new_folder
     from fwav_hil.simulation_results import simulate_run, simulate_spread
     from fwav_hil.tables import print_spread, print_summary
     from protocol.errors import DivergenceError, UsageError
-    from protocol.scenario import find_scenario
 
-    check_law(chosen, find_scenario(scenario))
+    check_law(scenario, choice.path)
+
     if seeds and out:
         raise UsageError("--seeds flies many runs and keeps none: leave out --out, or fly one --seed at a time")
     if seeds:
-        spread = simulate_spread(chosen, seeds)
+        spread = simulate_spread(scenario, seeds)
         print_spread(spread, to_stderr=is_stdout(json_path))
         show_json(json_path, spread)
         return
-    folder = new_folder(chosen, out) if out else None
-    summary = simulate_run(chosen, folder)
+    folder = new_folder(scenario, out) if out else None
+    summary = simulate_run(scenario, folder)
     if folder:
         _finish(folder, json_path, plots=plots)
     else:
@@ -280,11 +169,10 @@ def simulate_command(
         raise DivergenceError(summary["error"])
 
 
-@click.command("report", epilog="\b\nExample:\n  fwav-hil report runs/flapper-ude-2026-11-22T14-05-09")
-@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
-@plots_option
-@json_option
-def report_command(folder: Path, plots: bool, json_path: Path | None) -> None:
+@command("report", "fwav-hil report runs/flapper-ude-2026-11-22T14-05-09")
+def report_command(
+    folder: Annotated[Path, Argument(type=EXISTING_FOLDER)], plots: Plots = True, json_path: JsonPath = None
+) -> None:
     """Score and plot the run in FOLDER again, whatever became of the commands that flew it."""
     from fwav_hil.report import summarise
 

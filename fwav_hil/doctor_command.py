@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import click
 
-from bridge.command_line import json_option, options
-from bridge.option_types import FiniteRange
+from bridge.options import Option, command
+from bridge.shared_options import JsonPath
 from bridge.summary import is_stdout, show_json
 
 if TYPE_CHECKING:
@@ -20,19 +19,16 @@ RATES_HZ = (250.0, 500.0, 1000.0)
 UNKEPT_EXIT_CODE = 1
 
 
-@click.command("doctor", epilog="\b\nExample:\n  fwav-hil doctor --rate 500 --seconds 10 --json machine.json")
-@options(
-    click.option(
-        "--seconds", type=FiniteRange(min=0.1), default=5.0, show_default=True, metavar="S",
-        help="Length of each trial; there are two for each rate.",
-    ),
-    click.option(
-        "--rate", "rates_hz", type=FiniteRange(min=1.0, max=100_000.0), multiple=True, default=RATES_HZ,
-        show_default=True, metavar="HZ", help="A rate to try; may be given several times.",
-    ),
-    json_option,
-)  # fmt: skip
-def doctor(seconds: float, rates_hz: tuple[float, ...], json_path: Path | None) -> int:
+@command("doctor", "fwav-hil doctor --rate 500 --seconds 10 --json machine.json")
+def doctor(
+    seconds: Annotated[
+        float, Option("--seconds", "Length of each trial; there are two for each rate.", "S", min=0.1)
+    ] = 5.0,
+    rates_hz: Annotated[tuple[float, ...], Option(
+        "--rate", "A rate to try; may be given several times.", "HZ", min=1.0, max=100_000.0
+    )] = RATES_HZ,
+    json_path: JsonPath = None,
+) -> int:  # fmt: skip
     """Say what this machine can promise in real time, and what would mend what it cannot.
 
     Each rate is kept for some seconds by a process that does nothing else, first an ordinary one, then one with all that

@@ -5,6 +5,8 @@ from __future__ import annotations
 import click
 
 from fwav_hil.children import Child
+from fwav_hil.jobs import Job
+from plant_emulator.options import MotorOptions
 
 MOST_RESTARTS = 3
 
@@ -15,8 +17,8 @@ class MotorKeeper:
     restarts   times it was started again, since a signal had ended it
     """
 
-    def __init__(self, arguments: list[str]) -> None:
-        self._arguments = arguments
+    def __init__(self, job: Job[MotorOptions]) -> None:
+        self._job = job
         self.restarts = 0
         self._asked = False
         self._ended: list[Child] = []
@@ -53,4 +55,4 @@ class MotorKeeper:
         )
 
     def _start(self) -> Child:
-        return Child("plant_emulator.drives.motor_command", self._arguments, name="motor")
+        return Child("motor", self._job)

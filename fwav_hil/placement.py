@@ -15,37 +15,31 @@ class Placement(msgspec.Struct, frozen=True):
     neither, only that core. So: two cores and a short spin where there are two, one core where not. In real time each
     process sleeps, and the scheduler places it; with `--realtime` each has a core of its own, if there are two, and polls
     the end of a wait only.
+
+    emulator, controller: the core of each, if it matters. spin_s: how long each polls; None: as the process chooses.
     """
 
     text: str
-    emulator: tuple[str, ...] = ()
-    controller: tuple[str, ...] = ()
+    emulator: int | None = None
+    controller: int | None = None
+    spin_s: float | None = None
 
 
-SPIN_US = "500"
+SPIN_S = 500e-6
 """How long a lockstep process polls before it sleeps: several ticks' worth; longer waits are stalls."""
 
 
-def choose_placement(clock: str, *, realtime: bool = False, spin_us: int | None = None) -> Placement:
-    """The placement for a clock mode on this machine."""
+def choose_placement(clock: str, *, realtime: bool = False, spin_s: float | None = None) -> Placement:
+    """The placement for a clock mode on this machine; spin_s: how long to poll, where the user said so."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    wanted = () if spin_us is None else ("--spin-us", str(spin_us))
-    if realtime:
-        told = ("--realtime", *wanted)
-        if len(cores) < 2:
-            return Placement("both processes on the one core there is, sleeping while they wait", told, told)
-        return Placement(
-            f"a core each (emulator {cores[-1]}, controller {cores[-2]}), polling the end of each wait",
-            ("--core", str(cores[-1]), *told),
-            ("--core", str(cores[-2]), *told),
-        )
-    if clock == "lockstep" and len(cores) > 1:
-        spin = wanted or ("--spin-us", SPIN_US)
-        return Placement(
-            f"a core each (emulator {cores[-1]}, controller {cores[-2]}), polling up to {spin[1]} us before sleeping",
-            ("--core", str(cores[-1]), *spin),
-            ("--core", str(cores[-2]), *spin),
-        )
-    if clock == "lockstep" and cores:
-        return Placement("both processes on the one core there is, sleeping while they wait", wanted, wanted)
-    return Placement("placed by the scheduler, sleeping while they wait", wanted, wanted)
+    if (clock == "realtime" and not realtime) or not cores:
+        return Placement("placed by the scheduler, sleeping while they wait", spin_s=spin_s)
+    if len(cores) == 1:
+        return Placement("both processes on the one core there is, sleeping while they wait", spin_s=spin_s)
+    polling = "the end of each wait"
+    if clock == "lockstep":
+        spin_s = SPIN_S if spin_s is None else spin_s
+        polling = f"up to {1e6 * spin_s:.0f} us before sleeping"
+    return Placement(
+        f"a core each (emulator {cores[-1]}, controller {cores[-2]}), polling {polling}", cores[-1], cores[-2], spin_s
+    )

@@ -3,46 +3,36 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import click
 
-from bridge.command_line import json_option, log_error_option, options, wait_option
+from bridge.option_types import FILE
+from bridge.options import Option, command
+from bridge.shared_options import JsonPath, OnLogError, WaitS
 from bridge.summary import is_stdout, show_json
 
-EXAMPLE = """
-\b
-Example:
-  fwav-hil record --link udpin://127.0.0.1:14550 --out flight.tlog
-  fwav-hil record --link serial:///dev/ttyUSB0:57600 --link tcpout://127.0.0.1:5760 --duration 60
-"""
 
-
-@click.command("record", epilog=EXAMPLE)
-@options(
-    click.option(
-        "--link", "links", multiple=True, required=True, metavar="URI",
-        help="What to listen to: udpin://, tcpout://, tcpin://, serial:///dev/x:baud. Several: repeat the option.",
-    ),
-    click.option(
-        "--out", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
-        help="The log; by default a new one in this folder, named after the time.",
-    ),
-    click.option(
-        "--duration", "duration_s", type=click.FloatRange(min=0.0, min_open=True), metavar="S",
-        help="Stop after so many seconds; without it, at Ctrl-C.",
-    ),
-    wait_option,
-    log_error_option,
-    json_option,
-)  # fmt: skip
+@command(
+    "record",
+    "fwav-hil record --link udpin://127.0.0.1:14550 --out flight.tlog",
+    "fwav-hil record --link serial:///dev/ttyUSB0:57600 --link tcpout://127.0.0.1:5760 --duration 60",
+)
 def record_command(
-    links: tuple[str, ...],
-    out: Path | None,
-    duration_s: float | None,
-    wait_s: float,
-    on_log_error: str,
-    json_path: Path | None,
-) -> None:
+    links: Annotated[tuple[str, ...], Option(
+        "--link",
+        "What to listen to: udpin://, tcpout://, tcpin://, serial:///dev/x:baud. Several: repeat the option.", "URI"
+    )],
+    out: Annotated[Path | None, Option(
+        "--out", "The log; by default a new one in this folder, named after the time.", "FILE", type=FILE
+    )] = None,
+    duration_s: Annotated[float | None, Option(
+        "--duration", "Stop after so many seconds; without it, at Ctrl-C.", "S", min=0.0, min_open=True
+    )] = None,
+    wait_s: WaitS = 30.0,
+    on_log_error: OnLogError = "stop",
+    json_path: JsonPath = None,
+) -> None:  # fmt: skip
     """Record every frame of live links, with a sidecar that says which link each came by.
 
     Nothing is sent. Frames of unknown messages and of MAVLink 1 are kept. Ctrl-C ends the recording (exit code 0). Exit code

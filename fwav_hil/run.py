@@ -13,62 +13,21 @@ from typing import TYPE_CHECKING, Any
 import click
 import msgspec
 
-from bridge.links.link import parse_link_uri
+from bridge.links.link import counterpart, parse_link_uri, scheme_of
 from bridge.process import StopFlag
 from fwav_hil.children import Child, listen
+from fwav_hil.jobs import Job
 from fwav_hil.motor_child import MotorKeeper
-from fwav_hil.placement import Placement, choose_placement
+from fwav_hil.options import RunOptions
+from fwav_hil.placement import choose_placement
 from fwav_hil.run_folder import FILES
+from plant_emulator.options import MotorLink, MotorOptions
 from protocol.errors import FwavHilError, Interrupted, PeerError, UsageError
 from protocol.scenario import NANOSECONDS, Scenario
 
 if TYPE_CHECKING:
     from fwav_hil.progress import Progress
     from fwav_hil.studies.margin import Budget
-
-_IN_TO_OUT = {"udpin": "udpout", "tcpin": "tcpout"}
-
-
-class MotorsOnCan(msgspec.Struct, frozen=True, kw_only=True):
-    """The drives of a run on a CAN bus; see `plant_emulator.process.MotorLink`."""
-
-    can: str
-    feedback: str = "sync"
-    log: Path | None = None
-    tap: str | None = None
-
-    @property
-    def emulator_arguments(self) -> list[str]:
-        """What the emulator is told."""
-        arguments = ["--motor", "can", "--can", self.can, "--feedback", self.feedback]
-        arguments += ["--can-log", str(self.log)] if self.log else []
-        return arguments + (["--tap", self.tap] if self.tap else [])
-
-
-class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How the run is made. link: the emulator's URI; the controller gets its counterpart.
-
-    show_progress: False where the caller shows its own, and wants no line on the budget. delay_ns, legs: see
-    `EmulatorOptions`, as for truth_hz; station: the controller's, emulator_station: the emulator's `station`. realtime,
-    trigger, spin_us: see the commands' options.
-    """
-
-    clock: str = "lockstep"
-    link: str = "udpin://127.0.0.1:14560"
-    motors: MotorsOnCan | None = None
-    speed: float | None = None
-    wait_s: float = 30.0
-    realtime: bool = False
-    trigger: str = "sample"
-    spin_us: int | None = None
-    show_progress: bool = True
-    delay_ns: int = 0
-    legs: bool = False
-    on_log_error: str = "stop"
-    station: str | None = None
-    signing_key: Path | None = None
-    emulator_station: str | None = None
-    truth_hz: float | None = None
 
 
 class RunFailedError(FwavHilError):
@@ -85,7 +44,7 @@ _PATIENCE = 10
 
 def check_link(uri: str) -> None:
     """Raise UsageError where a controller cannot come to the emulator on this link."""
-    if uri.partition("://")[0] not in _IN_TO_OUT:
+    if not scheme_of(uri).waits:
         raise UsageError(
             f"`run` needs a link on which the controller can come to the emulator, and {uri} is none: use "
             "udpin://host:port or tcpin://host:port, or start both ends by themselves"
@@ -93,7 +52,7 @@ def check_link(uri: str) -> None:
     parse_link_uri(uri)
 
 
-def check_motors(scenario: Scenario, motors: MotorsOnCan) -> None:
+def check_motors(scenario: Scenario, motors: MotorLink) -> None:
     """Raise UsageError, LinkUriError or RunFolderError where the drives' bus cannot be what is asked for.
 
     Before anything is started, so that no folder is left behind.
@@ -121,11 +80,13 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
     check_link(options.link)
     stop = StopFlag()
     stop.install()
-    placement = choose_placement(options.clock, realtime=options.realtime, spin_us=options.spin_us)
-    emulator, controller = _start(folder, options, placement)
-    keeper = None
-    if options.motors and not options.motors.can.startswith("virtual:"):
-        keeper = MotorKeeper([str(folder / FILES["scenario"]), "--can", options.motors.can, "--out", str(folder)])
+    placement = choose_placement(options.clock, realtime=options.realtime, spin_s=options.spin_s)
+    of_emulator, of_controller = options.of_ends(folder, placement)
+    emulator = Child("plant_emulator", Job(scenario, of_emulator, of_emulator.core))
+    controller = Child("controller", Job(scenario, of_controller, of_controller.core))
+    keeper, motors = None, of_emulator.motors
+    if motors and not motors.can.startswith("virtual:"):
+        keeper = MotorKeeper(Job(scenario, MotorOptions(can=motors.can, out=folder)))
     try:
         budget, progress = _while_they_get_ready(scenario, options)
         _watch(scenario, emulator, controller, keeper, stop, progress)
@@ -145,33 +106,6 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
                 child.failure, child.process.returncode if child.process.returncode > 0 else PeerError.exit_code
             )
     return summary
-
-
-def _start(folder: Path, options: RunOptions, placement: Placement) -> tuple[Child, Child]:
-    """Start both processes. The controller learns its link when the emulator has opened its own.
-
-    Were the port another run's, it must not go there.
-    """
-    common = [str(folder / FILES["scenario"]), "--clock", options.clock, "--out", str(folder)]
-    common += ["--wait", str(options.wait_s), *(("--legs",) if options.legs else ())]
-    common += ["--signing-key", str(options.signing_key)] if options.signing_key else []
-    flight = ["--link", options.link, "--on-log-error", options.on_log_error]
-    if options.speed:
-        flight += ["--speed", str(options.speed)]
-    if options.delay_ns:
-        flight += ["--delay", f"{options.delay_ns}ns"]
-    if options.motors:
-        flight += options.motors.emulator_arguments
-    if options.truth_hz:
-        flight += ["--truth", str(options.truth_hz)]
-    if options.emulator_station:
-        flight += ["--station", options.emulator_station]
-    answers = ["--link", "-", "--arm", "--trigger", options.trigger]
-    answers += ["--station", options.station] if options.station else []
-    return (
-        Child("plant_emulator", [*common, *placement.emulator, *flight]),
-        Child("controller", [*common, *placement.controller, *answers]),
-    )
 
 
 def _while_they_get_ready(scenario: Scenario, options: RunOptions) -> tuple[Budget, Progress | None]:
@@ -206,8 +140,7 @@ def _watch(
                 keeper.look(children, emulator)
             if child is emulator and kind == "waiting":
                 told = True
-                scheme, _, address = event["link"].partition("://")
-                controller.tell(f"{_IN_TO_OUT[scheme]}://{address}")
+                controller.tell(counterpart(event["link"]))
             elif kind == "warning":
                 sys.stderr.write(event["text"] + "\n")
             elif progress and child is emulator and kind == "progress":

@@ -1,51 +1,115 @@
-"""How an emulator process runs."""
+"""How an emulator process runs, and one of drives on a CAN bus."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated, Literal
 
+import click
 import msgspec
+
+from bridge.option_types import FILE
+from bridge.options import Option
+from bridge.shared_options import (
+    DEFAULT_EMULATOR_LINK,
+    DelayNs,
+    EndOptions,
+    OnLogError,
+    ScenarioChoice,
+    Station,
+    folder_option,
+)
+from protocol.motors.motor_protocol import PROTOCOLS
+from protocol.scenario import Scenario, with_overrides
+
+_WITH_A_BUS = "--motor can"
+CanUri = Annotated[str, Option(
+    "--can", "The CAN bus: udp_multicast:group[:port], virtual:name, socketcan:can0, slcan:/dev/x.", "URI",
+    only_with=_WITH_A_BUS
+)]  # fmt: skip
+DEFAULT_CAN = "udp_multicast:239.74.163.2"
+
+
+class MotorScenarioChoice(ScenarioChoice, frozen=True, kw_only=True):
+    """A scenario, with what the command line changes in its drives too."""
+
+    protocol: Annotated[str | None, Option(
+        "--protocol", "What the drives speak, instead of the scenario's protocol.", type=click.Choice(list(PROTOCOLS)),
+        only_with=_WITH_A_BUS
+    )] = None  # fmt: skip
+    lag_s: Annotated[float | None, Option(
+        "--lag", "Lag of the drives' torque loop, instead of the scenario's.", "S", min=0.0, only_with=_WITH_A_BUS
+    )] = None  # fmt: skip
+
+    def load(self) -> Scenario:
+        """The scenario with the changes. Raises ScenarioError."""
+        scenario = super().load()
+        changes = {key: value for key in ("protocol", "lag_s") if (value := getattr(self, key)) is not None}
+        if not changes:
+            return scenario
+        return with_overrides(scenario, motor=msgspec.to_builtins(scenario.motor) | changes)
 
 
 class MotorLink(msgspec.Struct, frozen=True, kw_only=True):
-    """How the emulator reaches its drives.
+    """How the emulator reaches its drives. feedback "sync": every bit of u; "bus": the protocol's own status."""
 
-    can: URI of the bus. feedback: "sync" (every bit of u) or "bus" (the protocol's own status). log: where the bus is
-    recorded, by suffix; None: motor_bus.blf in the run folder, if there is one. tap: MAVLink link of the CAN tap.
-    """
+    can: CanUri = DEFAULT_CAN
+    feedback: Annotated[Literal["sync", "bus"], Option(
+        "--feedback",
+        "What the plant gets: every bit of the force behind the gears, or what the protocol's own status shows of it.",
+        only_with=_WITH_A_BUS
+    )] = "sync"  # fmt: skip
+    log: Annotated[Path | None, Option(
+        "--can-log", "Record of the bus: .blf, .log, .asc or .csv; by default motor_bus.blf in the run folder.",
+        "FILE", type=FILE, only_with=_WITH_A_BUS
+    )] = None  # fmt: skip
+    tap: Annotated[str | None, Option(
+        "--tap", "Show the bus as CAN_FRAME to a station on this MAVLink link (udpin://, tcpin://).", "URI",
+        only_with=_WITH_A_BUS
+    )] = None  # fmt: skip
 
-    can: str
-    feedback: str = "sync"
-    log: Path | None = None
-    tap: str | None = None
+
+class MotorOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """How a process of drives runs."""
+
+    can: CanUri = DEFAULT_CAN
+    out: Annotated[Path | None, folder_option("Folder for the counters.")] = None
 
 
-class EmulatorOptions(msgspec.Struct, frozen=True, kw_only=True):
+class EmulatorOptions(EndOptions, frozen=True, kw_only=True):
     """How the process runs.
 
-    speed: lockstep paced to that multiple of real time (None: as fast as it goes). delay_ns: real time: what comes is taken
-    so much later. legs: real time: note when each tick and command was where. realtime: ask for what `bridge.timing.realtime`
-    lists, with `core` as the core to have. spin_s: in lockstep see `Link.spin_s` (None: 0); in real time how long to poll
-    before each deadline (None: as measured with `realtime`, else 0).
-    on_log_error: what a disk that refuses means for the run: "stop", or "continue" with what can be recorded.
-    motors: where the drives are, if not in the plant itself. station: URI of a ground station's link. truth_hz: say the true
-    state on the link at this rate, as if its peer had asked for it. key: of signatures on
-    the loop's link. profile: of lockstep, "exact" or "tolerant".
+    speed: None is as fast as it goes. delay_ns: what comes is taken so much later. truth_hz: as if the peer had asked for it.
+    bus: where the drives are, with `motor` "can". core: the one to have with `realtime`.
     """
 
-    link: str
-    clock: str = "lockstep"
-    speed: float | None = None
-    out: Path | None = None
-    wait_s: float = 30.0
-    spin_s: float | None = None
-    delay_ns: int = 0
-    legs: bool = False
-    on_log_error: str = "stop"
-    realtime: bool = False
+    link: Annotated[str, Option(
+        "--link", "Where the controller is: udpin://, udpout://, tcpin://, tcpout://, serial:///dev/x:baud.", "URI"
+    )] = DEFAULT_EMULATOR_LINK  # fmt: skip
+    speed: Annotated[float | None, Option(
+        "--speed", "Pace lockstep to X times real time; without it, as fast as it goes.", "X", min=0.001
+    )] = None  # fmt: skip
+    profile: Annotated[Literal["exact", "tolerant"], Option(
+        "--profile",
+        "Lockstep that waits for each answer of our controller, or bears with an autopilot that answers in its own "
+        "time."
+    )] = "exact"  # fmt: skip
+    delay_ns: DelayNs = 0
+    truth_hz: Annotated[float | None, Option(
+        "--truth",
+        "Say the true state on the link, and so in the log, at this rate: HIL_STATE_QUATERNION and ODOMETRY.", "HZ",
+        min=0.1
+    )] = None  # fmt: skip
+    motor: Annotated[Literal["direct", "can"], Option(
+        "--motor", "Motors and gears in the emulator, or in drives on a CAN bus."
+    )] = "direct"  # fmt: skip
+    bus: MotorLink = MotorLink()
+    station: Station = None
+    out: Annotated[Path | None, folder_option("Folder for the log, the ground truth and the counters.")] = None
+    on_log_error: OnLogError = "stop"
     core: int | None = None
-    motors: MotorLink | None = None
-    station: str | None = None
-    key: bytes | None = None
-    truth_hz: float | None = None
-    profile: str = "exact"
+
+    @property
+    def motors(self) -> MotorLink | None:
+        """How the drives are reached; None where they are in the plant itself."""
+        return self.bus if self.motor == "can" else None

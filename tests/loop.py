@@ -11,8 +11,9 @@ import controller.process as controller_process
 import plant_emulator.process
 from bridge.links.link import Link
 from bridge.process import StopFlag
+from bridge.shared_options import ClockMode
 from controller.laws.law import make_law
-from controller.options import ControllerOptions
+from controller.options import ControllerOptions, Trigger
 from controller.process import serve
 from plant_emulator.options import EmulatorOptions, MotorLink
 from plant_emulator.process import fly
@@ -41,12 +42,12 @@ def fly_both(
     out: Path | None = None,
     *,
     controller_scenario: Scenario | None = None,
-    clock: str = "lockstep",
+    clock: ClockMode = "lockstep",
     arm: bool = True,
     legs: bool = False,
     wait_s: float = 20.0,
     motors: MotorLink | None = None,
-    trigger: str = "sample",
+    trigger: Trigger = "sample",
     spin_s: float | None = None,
     station: str | None = None,
     truth_hz: float | None = None,
@@ -55,8 +56,8 @@ def fly_both(
     """Run both ends to their end."""
     theirs = controller_scenario or scenario
     emulator = EmulatorOptions(
-        link="-", clock=clock, out=out, wait_s=wait_s, legs=legs, motors=motors, spin_s=spin_s, station=station,
-        truth_hz=truth_hz,
+        link="-", clock=clock, out=out, wait_s=wait_s, legs=legs, motor="can" if motors else "direct",
+        bus=motors or MotorLink(), spin_s=spin_s, station=station, truth_hz=truth_hz,
     )  # fmt: skip
     service_options = ControllerOptions(
         link="-", clock=clock, out=out, wait_s=wait_s, arm=arm, legs=legs, trigger=trigger, spin_s=spin_s,

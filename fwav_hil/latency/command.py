@@ -5,23 +5,12 @@ from __future__ import annotations
 import contextlib
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import click
-
-from bridge.command_line import (
-    chosen_scenario,
-    delay_option,
-    duration_option,
-    json_option,
-    law_option,
-    options,
-    rate_option,
-    realtime_option,
-    scenario_argument,
-    seed_option,
-    wait_option,
-)
+from bridge.links.link import scheme_of
+from bridge.option_types import EXISTING_FOLDER
+from bridge.options import Option, command, given_options
+from bridge.shared_options import DelayNs, JsonPath, RealTime, ScenarioChoice, WaitS, folder_option
 from bridge.summary import is_stdout, make_folder, read_json, show_json, write_json
 from protocol.errors import FwavHilError, Interrupted, PeerMissingError, RunFolderError, UsageError
 
@@ -34,45 +23,42 @@ RESULT = "latency.json"
 FREE_PORT = "udpin://127.0.0.1:0"
 _ASKED_RATE_HZ, _ASKED_S = 50.0, 10.0
 _MOST_HZ, _MOST_QUESTIONS = 10_000.0, 10_000_000.0
-EXAMPLE = """
-\b
-Example:
-  fwav-hil latency flapper --rate 500 --duration 60 --against
-  fwav-hil latency flapper --rate 500 --delay 5ms --json delayed.json
-  fwav-hil latency --link serial:///dev/ttyUSB0:921600 --rate 50      an autopilot, by TIMESYNC alone
-  fwav-hil latency --from RUN --controller-from RUN_OF_THE_OTHER_HOST --out REPORT
-"""
 
 
-@click.command("latency", epilog=EXAMPLE)
-@options(
-    scenario_argument, law_option, rate_option, duration_option, seed_option,
-    click.option(
-        "--link", default=FREE_PORT, show_default=True, metavar="URI",
-        help="udpin:// or tcpin://: fly the closed loop on it. Any other link: ask whoever is there, by TIMESYNC.",
-    ),
-    delay_option, realtime_option,
-    click.option("--against", is_flag=True, help="Measure a bare UDP echo, a mavutil script and cyclictest beside it."),
-    click.option(
-        "--from", "folder", type=click.Path(exists=True, file_okay=False, path_type=Path), metavar="DIR",
-        help="Fly nothing: report the run in this folder, flown with --legs.",
-    ),
-    click.option(
-        "--controller-from", "controller_folder", type=click.Path(exists=True, file_okay=False, path_type=Path),
-        metavar="DIR", help="With --from: the controller's folder, where it ran on another machine.",
-    ),
-    click.option(
-        "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
-        help="Folder of the run, its histograms (.hgrm) and the plot; by default a new one in runs/. With --from: of "
-        "histograms and plot, instead of the run's own.",
-    ),
-    wait_option, json_option,
-)  # fmt: skip
-@click.pass_context
+@command(
+    "latency",
+    "fwav-hil latency flapper --rate 500 --duration 60 --against",
+    "fwav-hil latency flapper --rate 500 --delay 5ms --json delayed.json",
+    "fwav-hil latency --link serial:///dev/ttyUSB0:921600 --rate 50      an autopilot, by TIMESYNC alone",
+    "fwav-hil latency --from RUN --controller-from RUN_OF_THE_OTHER_HOST --out REPORT",
+)
 def latency(
-    context: click.Context, scenario: str, law: str | None, rate: float | None, duration: float | None, seed: int | None,
-    link: str, delay_ns: int, realtime: bool, against: bool, folder: Path | None, controller_folder: Path | None,
-    out: Path | None, wait_s: float, json_path: Path | None,
+    choice: ScenarioChoice,
+    link: Annotated[str, Option(
+        "--link",
+        "udpin:// or tcpin://: fly the closed loop on it. Any other link: ask whoever is there, by TIMESYNC.", "URI"
+    )] = FREE_PORT,
+    delay_ns: DelayNs = 0,
+    realtime: RealTime = False,
+    against: Annotated[
+        bool, Option("--against", "Measure a bare UDP echo, a mavutil script and cyclictest beside it.")
+    ] = False,
+    folder: Annotated[Path | None, Option(
+        "--from", "Fly nothing: report the run in this folder, flown with --legs.", "DIR", type=EXISTING_FOLDER
+    )] = None,
+    controller_folder: Annotated[Path | None, Option(
+        "--controller-from", "With --from: the controller's folder, where it ran on another machine.", "DIR",
+        type=EXISTING_FOLDER, only_with="--from"
+    )] = None,
+    out: Annotated[
+        Path | None,
+        folder_option(
+            "Folder of the run, its histograms (.hgrm) and the plot; by default a new one in runs/. With --from: of "
+            "histograms and plot, instead of the run's own."
+        ),
+    ] = None,
+    wait_s: WaitS = 30.0,
+    json_path: JsonPath = None,
 ) -> None:  # fmt: skip
     """Measure where the time goes between a sample and its command, in the real-time closed loop or on a real link."""
     from fwav_hil.tables import plain_console
@@ -80,40 +66,35 @@ def latency(
     to_stderr = is_stdout(json_path)
     terminal = (sys.stderr if to_stderr else sys.stdout).isatty()
     console = plain_console(to_stderr=to_stderr, width=None if terminal else 120)
-    if controller_folder and not folder:
-        raise UsageError("--controller-from says where the other half of --from DIR is: give both")
     if folder:
-        _refuse_others(context, "with --from nothing is flown", ("folder", "controller_folder", "out", "json_path"))
+        _refuse_others("with --from nothing is flown", "--from", "--controller-from", "--out", "--json")
         if out:
             if (out / RESULT).exists():
                 raise RunFolderError(f"{out} holds a latency report already, which stays: choose another with --out")
             make_folder(out)
         _report(folder, controller_folder, None, console, json_path, out=out)
         return
-    if link.partition("://")[0] not in ("udpin", "tcpin"):
-        _refuse_others(
-            context,
-            f"whoever is at {link} is asked by TIMESYNC alone",
-            ("link", "rate", "duration", "wait_s", "json_path"),
-        )
-        rate_hz, seconds = _ASKED_RATE_HZ if rate is None else rate, _ASKED_S if duration is None else duration
+    if not scheme_of(link).waits:
+        asked = f"whoever is at {link} is asked by TIMESYNC alone"
+        _refuse_others(asked, "--link", "--rate", "--duration", "--wait", "--json")
+        rate_hz = _ASKED_RATE_HZ if choice.rate_hz is None else choice.rate_hz
+        seconds = _ASKED_S if choice.duration_s is None else choice.duration_s
         _ask(link, rate_hz, seconds, wait_s, console, json_path)
         return
-    chosen = chosen_scenario(scenario, rate_hz=rate, duration_s=duration, seed=seed, law=law)
+    scenario = choice.load()
     from bridge.process import StopFlag
     from controller.laws.registry import refuse_on_a_link
     from fwav_hil.compile import compile_kernels
     from fwav_hil.latency.study import LONGEST_PROBING_S, beside, closed_loop
     from fwav_hil.run import check_link
     from fwav_hil.run_folder import new_folder
-    from protocol.scenario import find_scenario
 
-    refuse_on_a_link(chosen, find_scenario(scenario))
+    refuse_on_a_link(scenario, choice.path)
     check_link(link)
-    compile_kernels(chosen)
-    folder = new_folder(chosen, out)
+    compile_kernels(scenario)
+    folder = new_folder(scenario, out)
     try:
-        closed_loop(chosen, folder, link=link, delay_ns=delay_ns, wait_s=wait_s, realtime=realtime)
+        closed_loop(scenario, folder, link=link, delay_ns=delay_ns, wait_s=wait_s, realtime=realtime)
     except FwavHilError:
         # The run's own error is the one to end with; what there is of it is reported all the same.
         with contextlib.suppress(FwavHilError):
@@ -123,7 +104,7 @@ def latency(
     stop.install()
     try:
         with _Bar() as told:
-            found = beside(chosen.rate_hz, min(LONGEST_PROBING_S, chosen.duration_s), stop, told, against=against)
+            found = beside(scenario.rate_hz, min(LONGEST_PROBING_S, scenario.duration_s), stop, told, against=against)
     except Interrupted:
         raise Interrupted(
             f"interrupted after the run, which is in {folder}: `fwav-hil latency --from {folder}` reports it"
@@ -131,13 +112,11 @@ def latency(
     _report(folder, None, found, console, json_path)
 
 
-def _refuse_others(context: click.Context, why: str, known: tuple[str, ...]) -> None:
+def _refuse_others(why: str, *known: str) -> None:
     """Raise UsageError where an argument was given that would do nothing."""
-    for parameter in context.command.params:
-        given = context.get_parameter_source(parameter.name or "") is not click.core.ParameterSource.DEFAULT
-        if given and parameter.name not in known:
-            name = parameter.opts[0] if parameter.opts[0].startswith("-") else parameter.opts[0].upper()
-            raise UsageError(f"{why}, so {name} would do nothing: leave it out")
+    for flag in given_options():
+        if flag not in known:
+            raise UsageError(f"{why}, so {flag} would do nothing: leave it out")
 
 
 def _report(

@@ -15,11 +15,13 @@ from bridge.summary import read_json
 from fwav_hil.latency.analysis import LEGS, Legs, clock_check
 from fwav_hil.latency.histogram import percentiles, write_hgrm
 from fwav_hil.latency.peers import cyclictest, probe_echo, probe_mavutil, probe_responder
+from fwav_hil.options import RunOptions
 from fwav_hil.report import summarise
-from fwav_hil.run import RunOptions, run
+from fwav_hil.run import run
 from fwav_hil.run_folder import FILES
 from fwav_hil.score import scores
 from fwav_hil.simulate import Simulation, simulate
+from plant_emulator.options import EmulatorOptions
 from protocol.scenario import NANOSECONDS, Delay, Scenario
 
 Told = Callable[[str, float], None]
@@ -33,7 +35,8 @@ def closed_loop(
     scenario: Scenario, folder: Path, *, link: str, delay_ns: int, wait_s: float, realtime: bool
 ) -> dict[str, Any]:
     """Fly the scenario in real time with time stamps; returns the run's summary. Raises what `run` raises."""
-    how = RunOptions(clock="realtime", link=link, wait_s=wait_s, delay_ns=delay_ns, legs=True, realtime=realtime)
+    emulator = EmulatorOptions(delay_ns=delay_ns)
+    how = RunOptions(clock="realtime", link=link, wait_s=wait_s, legs=True, realtime=realtime, emulator=emulator)
     return run(scenario, folder, how)
 
 

@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Annotated
 
 import click
 
-from bridge.command_line import json_option, options
+from bridge.option_types import FILE
+from bridge.options import Argument, Option, command
+from bridge.shared_options import JsonPath
 from bridge.summary import is_stdout, show_json
 from protocol.errors import UsageError
 
-log_argument = click.argument("log", type=click.Path(path_type=Path))
-system_option = click.option(
-    "--system", "systems", multiple=True, metavar="N[/C]",
-    help="Messages of this system, or of one component of it, only; may be repeated.",
-)  # fmt: skip
-from_option = click.option(
-    "--from", "start", metavar="TIME", help="From here on: seconds since the log began, or HH:MM:SS (UTC)."
-)
-when_options = options(
-    system_option, from_option, click.option("--to", "end", metavar="TIME", help="Up to here, as in --from.")
-)
-types_option = click.option(
-    "--types", multiple=True, metavar="MSG,...", help="Messages of these names only; may be repeated."
-)
+LogPath = Annotated[Path, Argument()]
+Systems = Annotated[tuple[str, ...], Option(
+    "--system", "Messages of this system, or of one component of it, only; may be repeated.", "N[/C]"
+)]  # fmt: skip
+Start = Annotated[str | None, Option("--from", "From here on: seconds since the log began, or HH:MM:SS (UTC).", "TIME")]
+End = Annotated[str | None, Option("--to", "Up to here, as in --from.", "TIME")]
+Types = Annotated[tuple[str, ...], Option("--types", "Messages of these names only; may be repeated.", "MSG,...")]
 
 
 @click.group("log", epilog="\b\nExample:\n  fwav-hil log info runs/flapper-ude-2026-11-22T14-05-09/run.tlog")
@@ -36,9 +32,8 @@ def log_group() -> None:
     """
 
 
-@log_group.command("info", epilog="\b\nExample:\n  fwav-hil log info flight.tlog --json -")
-@options(log_argument, json_option)
-def info_command(log: Path, json_path: Path | None) -> None:
+@command("info", "fwav-hil log info flight.tlog --json -", group=log_group)
+def info_command(log: LogPath, json_path: JsonPath = None) -> None:
     """Say what is in LOG: senders, messages, rates, gaps, losses, damage."""
     from fwav_hil.logs.choice import open_with_progress
     from fwav_hil.logs.info import log_info, print_info
@@ -48,15 +43,14 @@ def info_command(log: Path, json_path: Path | None) -> None:
     show_json(json_path, info)
 
 
-@log_group.command("dump", epilog="\b\nExample:\n  fwav-hil log dump flight.tlog --types ATTITUDE --from 10 --to 12.5")
-@options(
-    log_argument,
-    types_option,
-    when_options,
-    click.option("--json", "as_json", is_flag=True, help="One JSON object a line instead of text."),
-)
+@command("dump", "fwav-hil log dump flight.tlog --types ATTITUDE --from 10 --to 12.5", group=log_group)
 def dump_command(
-    log: Path, types: tuple[str, ...], systems: tuple[str, ...], start: str | None, end: str | None, as_json: bool
+    log: LogPath,
+    types: Types = (),
+    systems: Systems = (),
+    start: Start = None,
+    end: End = None,
+    as_json: Annotated[bool, Option("--json", "One JSON object a line instead of text.")] = False,
 ) -> None:
     """Print the messages of LOG, one a line, in their order."""
     from fwav_hil.logs.choice import choose, open_with_progress
@@ -71,22 +65,17 @@ def dump_command(
     sys.stdout.flush()
 
 
-@log_group.command("plot", epilog="\b\nExample:\n  fwav-hil log plot flight.tlog ATTITUDE.roll ATT_POS_MOCAP.q[2]")
-@options(
-    log_argument,
-    click.argument("fields", nargs=-1, required=True, metavar="MSG.FIELD..."),
-    click.option("--out", type=click.Path(dir_okay=False, path_type=Path), metavar="PNG",
-                 help="File to draw into; by default the log's name with _plot.png, in this folder."),
-    when_options,
-)  # fmt: skip
+@command("plot", "fwav-hil log plot flight.tlog ATTITUDE.roll ATT_POS_MOCAP.q[2]", group=log_group)
 def plot_command(
-    log: Path,
-    fields: tuple[str, ...],
-    out: Path | None,
-    systems: tuple[str, ...],
-    start: str | None,
-    end: str | None,
-) -> None:
+    log: LogPath,
+    fields: Annotated[tuple[str, ...], Argument("MSG.FIELD...")],
+    out: Annotated[Path | None, Option(
+        "--out", "File to draw into; by default the log's name with _plot.png, in this folder.", "PNG", type=FILE
+    )] = None,
+    systems: Systems = (),
+    start: Start = None,
+    end: End = None,
+) -> None:  # fmt: skip
     """Draw fields of LOG over time: MSG.field, or MSG.field[i] for one element of an array."""
     from fwav_hil.logs.choice import choose, open_with_progress
     from fwav_hil.logs.plot import plot_log
@@ -97,32 +86,22 @@ def plot_command(
     click.echo(f"plot: {path}")
 
 
-@log_group.command(
-    "export", epilog="\b\nExample:\n  fwav-hil log export flight.tlog --to mcap --types ATTITUDE --from 10 --to 60"
-)
-@options(
-    log_argument,
-    click.option(
-        "--to", "targets", multiple=True, required=True, metavar="FORMAT|TIME",
-        help="mcap: one file for Foxglove and PlotJuggler. parquet, csv: a folder with one file for each message. "
-        "A time: where to end, as --from.",
-    ),
-    types_option,
-    system_option,
-    from_option,
-    click.option("--out", type=click.Path(path_type=Path), metavar="PATH",
-                 help="File (mcap) or folder; by default named after the log, in this folder."),
-    json_option,
-)  # fmt: skip
+@command("export", "fwav-hil log export flight.tlog --to mcap --types ATTITUDE --from 10 --to 60", group=log_group)
 def export_command(
-    log: Path,
-    targets: tuple[str, ...],
-    types: tuple[str, ...],
-    systems: tuple[str, ...],
-    start: str | None,
-    out: Path | None,
-    json_path: Path | None,
-) -> None:
+    log: LogPath,
+    targets: Annotated[tuple[str, ...], Option(
+        "--to",
+        "mcap: one file for Foxglove and PlotJuggler. parquet, csv: a folder with one file for each message. A time: "
+        "where to end, as --from.", "FORMAT|TIME"
+    )],
+    types: Types = (),
+    systems: Systems = (),
+    start: Start = None,
+    out: Annotated[
+        Path | None, Option("--out", "File (mcap) or folder; by default named after the log, in this folder.", "PATH")
+    ] = None,
+    json_path: JsonPath = None,
+) -> None:  # fmt: skip
     """Write LOG in a format of other programs. What is there already is never overwritten."""
     from fwav_hil.logs.choice import choose, choose_frames, open_with_progress
     from fwav_hil.logs.export import SUFFIXES, default_output, export_log

@@ -4,39 +4,35 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-import click
-
-from bridge.command_line import json_option, options
+from bridge.option_types import EXISTING
+from bridge.options import Argument, Option, command
+from bridge.shared_options import JsonPath
 from bridge.summary import is_stdout, show_json
 
 if TYPE_CHECKING:
     from fwav_hil.replay.log_comparison import LogDifference
 
-EXAMPLE = """
-\b
-Example:
-  fwav-hil diff runs/before runs/after
-  fwav-hil diff a.tlog b.tlog --types ATT_POS_MOCAP --tolerance q=1e-6 --tolerance HIL_SENSOR.xacc=0.01 --tolerance 1e-5
-"""
 _SHOWN_ROWS = 30
+ExistingLog = Annotated[Path, Argument(type=EXISTING)]
 
 
-@click.command("diff", epilog=EXAMPLE)
-@options(
-    click.argument("first", type=click.Path(exists=True, path_type=Path)),
-    click.argument("second", type=click.Path(exists=True, path_type=Path)),
-    click.option(
-        "--tolerance", "tolerances", multiple=True, metavar="[FIELD=]VALUE",
-        help="What a field (FIELD, or MESSAGE.FIELD) may differ by; without FIELD, all others. Default: 0.",
-    ),
-    click.option("--types", multiple=True, metavar="NAME,...", help="Compare only these messages."),
-    json_option,
-)  # fmt: skip
+@command(
+    "diff",
+    "fwav-hil diff runs/before runs/after",
+    "fwav-hil diff a.tlog b.tlog --types ATT_POS_MOCAP --tolerance q=1e-6 --tolerance HIL_SENSOR.xacc=0.01 --tolerance 1e-5",
+)
 def diff_command(
-    first: Path, second: Path, tolerances: tuple[str, ...], types: tuple[str, ...], json_path: Path | None
-) -> int:
+    first: ExistingLog,
+    second: ExistingLog,
+    tolerances: Annotated[tuple[str, ...], Option(
+        "--tolerance", "What a field (FIELD, or MESSAGE.FIELD) may differ by; without FIELD, all others. Default: 0.",
+        "[FIELD=]VALUE"
+    )] = (),
+    types: Annotated[tuple[str, ...], Option("--types", "Compare only these messages.", "NAME,...")] = (),
+    json_path: JsonPath = None,
+) -> int:  # fmt: skip
     """Compare two logs (or run folders): rows are paired by the sample time that their messages carry.
 
     \b

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
 from bridge.endpoint import Endpoint
-from bridge.links.link import Link, open_link
+from bridge.links.link import Link, counterpart, open_link
 from bridge.process import StopFlag
 from controller.laws.law import make_law
 from controller.laws.registry import refuse_on_a_link
+from controller.options import ControllerOptions
 from controller.parameters import followed
 from controller.sinks.hil import HilSink
 from controller.sources.hil import HilSource
 from controller.tick import Tick
+from fwav_hil.jobs import Job
 from fwav_hil.replay import recorded_run
 from fwav_hil.replay.other_end import other_end
 from fwav_hil.replay.recorded_run import Recorded
@@ -75,13 +75,11 @@ def replay_into_process(run: Recorded, wait_s: float, stop: StopFlag) -> Differe
     Raises UsageError for state feedback, LinkError, PeerError and Interrupted.
     """
     refuse_on_a_link(run.scenario)
-    with tempfile.TemporaryDirectory(prefix="fwav-hil-replay-") as folder, open_link(_LINK) as link:
-        scenario = Path(folder) / "scenario.toml"
-        scenario.write_text(run.scenario.to_toml(), encoding="utf-8")
-        clock = "lockstep" if run.lockstep else "realtime"
-        address = link.uri.partition("://")[2]
-        arguments = [str(scenario), "--clock", clock, "--wait", str(wait_s), "--link", f"udpout://{address}", "--arm"]
-        with other_end("controller", arguments, stop) as (_, watch):
+    with open_link(_LINK) as link:
+        options = ControllerOptions(
+            link=counterpart(link.uri), clock="lockstep" if run.lockstep else "realtime", wait_s=wait_s
+        )
+        with other_end("controller", Job(run.scenario, options), stop) as (_, watch):
             return compare_commands(run, ask_controller(run, link, wait_s, watch))
 
 

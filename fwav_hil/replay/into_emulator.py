@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
 from bridge.endpoint import Endpoint
-from bridge.links.link import Link
+from bridge.links.link import Link, counterpart
 from bridge.links.memory import memory_pair
 from bridge.process import StopFlag, open_patiently
 from fwav_hil.children import Child, listen
+from fwav_hil.jobs import Job
 from fwav_hil.replay.other_end import other_end
 from fwav_hil.replay.recorded_run import Recorded, Tick
 from fwav_hil.replay.replay_result import Difference
 from plant_emulator.command_source import Found
+from plant_emulator.options import EmulatorOptions
 from plant_emulator.tick import Emulator
 from protocol.errors import PeerLostError, PeerMissingError
 from protocol.messages import VEHICLE, FloatArray
+from protocol.scenario import with_overrides
 from protocol.wire import mapping
 from protocol.wire.codec import FrameReader
 
@@ -65,22 +66,19 @@ def replay_into_process(run: Recorded, wait_s: float, stop: StopFlag) -> Differe
 
     Raises LinkError, PeerError and Interrupted.
     """
-    with tempfile.TemporaryDirectory(prefix="fwav-hil-replay-") as folder:
-        scenario = Path(folder) / "scenario.toml"
-        scenario.write_text(run.scenario.to_toml(), encoding="utf-8")
-        arguments = [str(scenario), "--wait", str(wait_s), "--link", "udpin://127.0.0.1:0"]
-        arguments += ["--duration", repr(len(run.ticks) * run.scenario.period_ns * 1e-9)]
-        with (
-            other_end("plant_emulator", arguments, stop) as (child, watch),
-            open_patiently(f"udpout://{_address(child)}", wait_s, watch) as link,
-        ):
-            return compare_motion(run, answer_emulator(run, link, wait_s, watch))
+    scenario = with_overrides(run.scenario, duration_s=len(run.ticks) * run.scenario.period_ns * 1e-9)
+    options = EmulatorOptions(link="udpin://127.0.0.1:0", wait_s=wait_s)
+    with (
+        other_end("plant_emulator", Job(scenario, options), stop) as (child, watch),
+        open_patiently(counterpart(_link_of(child)), wait_s, watch) as link,
+    ):
+        return compare_motion(run, answer_emulator(run, link, wait_s, watch))
 
 
-def _address(child: Child) -> str:
+def _link_of(child: Child) -> str:
     for _, event in listen([child]):
         if event.get("event") == "waiting":
-            return str(event["link"]).partition("://")[2]
+            return str(event["link"])
     child.end()
     raise PeerMissingError(child.failure or "the emulator ended before it opened its link")
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from bridge.process import StopFlag
 from fwav_hil.children import Child
+from fwav_hil.jobs import Job
 from protocol.errors import PeerLostError
 
 
@@ -24,13 +26,13 @@ class WatchingStop(StopFlag):
         if self._child.process.poll():
             if self._child.process.stderr:
                 self._child.error += self._child.process.stderr.read().decode(errors="replace")
-            raise PeerLostError(self._child.failure or f"the {self._child.module} process ended")
+            raise PeerLostError(self._child.failure or f"the {self._child.name} process ended")
 
 
 @contextmanager
-def other_end(module: str, arguments: list[str], stop: StopFlag) -> Iterator[tuple[Child, WatchingStop]]:
+def other_end(name: str, job: Job[Any], stop: StopFlag) -> Iterator[tuple[Child, WatchingStop]]:
     """Start a process of the project for as long as the block lasts."""
-    child = Child(module, arguments)
+    child = Child(name, job)
     try:
         yield child, WatchingStop(stop, child)
     finally:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -23,28 +22,17 @@ from bridge.timing.realtime import Settings, maybe_real_time, own_core, report_s
 from fwav_hil.logs.choice import time_of_day
 from fwav_hil.progress import StatusLine
 from fwav_hil.replay.keyboard import HELP, Keyboard
+from fwav_hil.replay.options import ReplayOptions
 from protocol.errors import PeerMissingError, UsageError
 from protocol.logs.dialect import layouts
 from protocol.logs.retime import TimeMover
 from protocol.logs.scan import Scan
-from protocol.wire.signing import Signatures, read_key
+from protocol.wire.signing import Signatures
 
 _DRAIN_LIMIT = 100
 _DRAW_PERIOD_NS = 200_000_000
 _DRAW_ROOM_NS = 3_000_000
 """Drawing the bar takes a millisecond or two: it waits for a moment when nothing is due, at most five periods."""
-
-
-class ReplayOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How a log is replayed. speed: of log time; None is as fast as it goes. realtime: with what `real_time` asks for."""
-
-    speed: float | None = 1.0
-    loop: bool = False
-    max_gap_s: float | None = None
-    rewrite_time: bool = False
-    signing_key: Path | None = None
-    realtime: bool = False
-    wait_s: float = 30.0
 
 
 def replay_to(
@@ -53,11 +41,10 @@ def replay_to(
     """Replay the chosen frames; returns what was sent, and how punctually. Raises LinkError, PeerError and UsageError,
     and Interrupted where the user stopped it before it began.
     """
-    key = read_key(options.signing_key) if options.signing_key else None
     with open_patiently(uri, options.wait_s, stop) as link:
         clock = PunctualClock(sleeps_half=options.realtime)
         _await_peer(link, options.wait_s, clock, stop)
-        replay = Replay(scan, chosen, link, options, clock, stop, key)
+        replay = Replay(scan, chosen, link, options, clock, stop)
         with maybe_real_time(own_core(0), wanted=options.realtime) as settings:
             report_settings(report, settings)
             return replay.run(settings)
@@ -90,7 +77,6 @@ class Replay:
         options: ReplayOptions,
         clock: Clock,
         stop: StopFlag,
-        key: bytes | None = None,
     ) -> None:
         self._scan = scan
         self._data = scan.data.data
@@ -104,7 +90,7 @@ class Replay:
         self._clock = clock
         self._stop = stop
         self._mover = TimeMover(scan, chosen, unix_time_us()) if options.rewrite_time else None
-        self._signer = Signatures(key, messages=layouts()) if key else None
+        self._signer = Signatures(options.key, messages=layouts()) if options.key else None
         self._not_signed = 0
         self._told_of_refusal = False
         self._were_signed = int(np.count_nonzero(scan.frames["signed"][chosen]))

@@ -4,58 +4,40 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
+import msgspec
 
-from bridge.command_line import json_option, law_option, options, rate_option
-from bridge.option_types import FiniteRange
+from bridge.option_types import FILE
+from bridge.options import Except, Option, command
+from bridge.shared_options import JsonPath, ScenarioChoice
 from bridge.summary import is_stdout, show_json
 from protocol.errors import RunFolderError
-from protocol.scenario import find_scenario, load_scenario, with_overrides
+from protocol.scenario import find_scenario, load_scenario
 
 
-@click.command(
-    "design", epilog="\b\nExample:\n  fwav-hil design flapper --rate 500 --delay-s 0.004 --out flapper_500.toml"
-)
-@options(
-    click.argument("scenario", default="flapper"),
-    law_option,
-    rate_option,
-    click.option(
-        "--delay-s", type=FiniteRange(min=0.0, max=1.0), metavar="S",
-        help="Total delay, sample to action, instead of the scenario's.",
-    ),
-    click.option(
-        "--out", type=click.Path(dir_okay=False, path_type=Path), required=True, metavar="FILE.toml",
-        help="The scenario file to write; one that exists is left alone.",
-    ),
-    click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the optimiser."),
-    click.option(
-        "--flights", type=click.IntRange(min=1), default=4, show_default=True, metavar="N",
-        help="Flights per set of gains, each with noise of its own.",
-    ),
-    click.option(
-        "--generations", type=click.IntRange(min=1), default=20, show_default=True, metavar="N",
-        help="Generations of the search, for attitude and for position.",
-    ),
-    click.option(
-        "--workers", type=click.IntRange(min=1), metavar="N", help="Processes to search on; by default one a core.",
-    ),
-    json_option,
-)  # fmt: skip
+@command("design", "fwav-hil design flapper --rate 500 --delay-s 0.004 --out flapper_500.toml")
 def design_command(
-    scenario: str,
-    law: str | None,
-    rate: float | None,
-    delay_s: float | None,
-    out: Path,
-    seed: int,
-    flights: int,
-    generations: int,
-    workers: int | None,
-    json_path: Path | None,
-) -> None:
+    choice: Annotated[ScenarioChoice, Except("duration_s", "seed")],
+    out: Annotated[
+        Path, Option("--out", "The scenario file to write; one that exists is left alone.", "FILE.toml", type=FILE)
+    ],
+    delay_s: Annotated[float | None, Option(
+        "--delay-s", "Total delay, sample to action, instead of the scenario's.", "S", min=0.0, max=1.0
+    )] = None,
+    seed: Annotated[int, Option("--seed", "Seed of the optimiser.", min=0)] = 1,
+    flights: Annotated[
+        int, Option("--flights", "Flights per set of gains, each with noise of its own.", "N", min=1)
+    ] = 4,
+    generations: Annotated[
+        int, Option("--generations", "Generations of the search, for attitude and for position.", "N", min=1)
+    ] = 20,
+    workers: Annotated[
+        int | None, Option("--workers", "Processes to search on; by default one a core.", "N", min=1)
+    ] = None,
+    json_path: JsonPath = None,
+) -> None:  # fmt: skip
     """Search gains K, Lambda, T and N for the link of SCENARIO: its rate, delay, noise and limits.
 
     Least tracking error with a gain margin of at least 2 both ways and stability at twice the delay. The result is a scenario
@@ -68,10 +50,10 @@ def design_command(
     from fwav_hil.studies.design_result import judge_design, print_design, scenario_text, with_delay
     from fwav_hil.studies.margin import at_rate
 
-    base_path = find_scenario(scenario)
-    start = with_overrides(load_scenario(base_path), law=law)
-    if rate is not None:
-        start = at_rate(start, rate)
+    base_path = find_scenario(choice.scenario)
+    start = msgspec.structs.replace(choice, rate_hz=None).load()
+    if choice.rate_hz is not None:
+        start = at_rate(start, choice.rate_hz)
     if delay_s is not None:
         start = with_delay(start, delay_s)
     gains_of(start)

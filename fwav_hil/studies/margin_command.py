@@ -4,46 +4,36 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Annotated
 
 import click
+import msgspec
 
-from bridge.command_line import json_option, law_option, options, rate_option, scenario_argument
-from bridge.option_types import FiniteRange
+from bridge.options import Except, Option, command
+from bridge.shared_options import JsonPath, ScenarioChoice, folder_option
 from bridge.summary import is_stdout, make_folder, show_json, write_json
 from protocol.errors import RunFolderError
-from protocol.scenario import find_scenario, load_scenario, with_overrides
 
 RESULT = "margin.json"
 
 
-@click.command("margin", epilog="\b\nExample:\n  fwav-hil margin flapper --rate 500 --out margins --json margins.json")
-@options(
-    scenario_argument,
-    law_option,
-    rate_option,
-    click.option(
-        "--gain-ratio", type=FiniteRange(min=0.0, min_open=True), metavar="R",
-        help="True input gain over the law's, g/b, in every channel instead of the scenario's: its gears are scaled.",
-    ),
-    click.option(
-        "--n-filter", type=FiniteRange(min=0.0, min_open=True), metavar="N",
-        help="Derivative pole N (1/s) in every channel instead of the scenario's.",
-    ),
-    click.option(
-        "--out", type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
-        help="Folder for the figures and margin.json; nothing is written without it.",
-    ),
-    json_option,
-)  # fmt: skip
+@command("margin", "fwav-hil margin flapper --rate 500 --out margins --json margins.json")
 def margin_command(
-    scenario: str,
-    law: str | None,
-    rate: float | None,
-    gain_ratio: float | None,
-    n_filter: float | None,
-    out: Path | None,
-    json_path: Path | None,
-) -> None:
+    choice: Annotated[ScenarioChoice, Except("duration_s", "seed")],
+    gain_ratio: Annotated[float | None, Option(
+        "--gain-ratio",
+        "True input gain over the law's, g/b, in every channel instead of the scenario's: its gears are scaled.", "R",
+        min=0.0, min_open=True
+    )] = None,
+    n_filter: Annotated[float | None, Option(
+        "--n-filter", "Derivative pole N (1/s) in every channel instead of the scenario's.", "N", min=0.0,
+        min_open=True
+    )] = None,
+    out: Annotated[
+        Path | None, folder_option("Folder for the figures and margin.json; nothing is written without it.")
+    ] = None,
+    json_path: JsonPath = None,
+) -> None:  # fmt: skip
     """Say whether the gains of SCENARIO stand its link: margins of gain, phase and delay, then the same flown.
 
     Verdict: good; thin (a gain margin under 2, or a largest delay under twice the loop's); unusable (unstable, or the flight
@@ -57,15 +47,14 @@ def margin_command(
     from fwav_hil.studies.margin_study import STEPS, as_json, study
     from fwav_hil.studies.margin_tables import print_study
 
-    path = find_scenario(scenario)
-    chosen = with_overrides(load_scenario(path), law=law)
-    check_law(chosen, path)
-    if rate is not None:
-        chosen = at_rate(chosen, rate)
+    scenario = msgspec.structs.replace(choice, rate_hz=None).load()
+    check_law(scenario, choice.path)
+    if choice.rate_hz is not None:
+        scenario = at_rate(scenario, choice.rate_hz)
     if gain_ratio is not None:
-        chosen = with_gain_ratio(chosen, gain_ratio)
+        scenario = with_gain_ratio(scenario, gain_ratio)
     if n_filter is not None:
-        chosen = with_derivative_pole(chosen, n_filter)
+        scenario = with_derivative_pole(scenario, n_filter)
     if out:
         if (out / RESULT).exists():
             raise RunFolderError(f"{out} holds a margin study already, which stays: choose another folder with --out")
@@ -76,7 +65,7 @@ def margin_command(
         def progress(text: str) -> None:
             bar.update(task, description=text, advance=1)
 
-        result = study(chosen, progress)
+        result = study(scenario, progress)
     content = as_json(result)
     if out:
         from fwav_hil.studies.margin_figures import draw_study

@@ -18,7 +18,8 @@ import numpy as np
 
 from controller.laws.law import make_law
 from controller.laws.ude import UdeGains
-from fwav_hil.run import RunOptions, run
+from fwav_hil.options import RunOptions
+from fwav_hil.run import run
 from fwav_hil.run_folder import FILES, new_folder
 from fwav_hil.score import scores
 from fwav_hil.simulate import Simulation, simulate

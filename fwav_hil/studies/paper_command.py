@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 import msgspec
 
-from bridge.command_line import json_option, options
+from bridge.options import Option, command
+from bridge.shared_options import JsonPath, folder_option
 from bridge.summary import make_folder, show_json, write_json, write_text
 from protocol.messages import AXES
 from protocol.scenario import Scenario, find_scenario, load_scenario
@@ -22,22 +23,17 @@ if TYPE_CHECKING:
 SCENARIOS = ("paper", "paper_disturbed")
 
 
-@click.command(
-    "paper",
-    epilog="\b\nExample:\n  fwav-hil paper --out /tmp/paper --json /tmp/paper.json\n  fwav-hil paper --wire --out /tmp/wire",
-)
-@options(
-    click.option(
-        "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("paper_study"), show_default=True,
-        metavar="DIR", help="Folder for the page (paper.md), tables (CSV, JSON) and figures (PNG, SVG).",
-    ),
-    click.option(
-        "--wire", is_flag=True,
-        help="Fly as two processes in lockstep instead of in this one, and compare with it; no state feedback there.",
-    ),
-    json_option,
-)  # fmt: skip
-def paper_command(out: Path, wire: bool, json_path: Path | None) -> None:
+@command("paper", "fwav-hil paper --out /tmp/paper --json /tmp/paper.json", "fwav-hil paper --wire --out /tmp/wire")
+def paper_command(
+    out: Annotated[
+        Path, folder_option("Folder for the page (paper.md), tables (CSV, JSON) and figures (PNG, SVG).")
+    ] = Path("paper_study"),
+    wire: Annotated[bool, Option(
+        "--wire",
+        "Fly as two processes in lockstep instead of in this one, and compare with it; no state feedback there."
+    )] = False,
+    json_path: JsonPath = None,
+) -> None:  # fmt: skip
     """Run the source paper's section IV again: tables II-IV, figures 3-8, its claims judged cell by cell."""
     from rich.console import Console
     from rich.progress import Progress

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import threading
-from pathlib import Path
 from types import TracebackType
 from typing import Any
-
-import msgspec
 
 from bridge.motor_bus.can_bus import CanBus
 from bridge.process import StopFlag, take_folder
@@ -15,6 +12,7 @@ from bridge.reporting import Report
 from bridge.summary import write_json
 from bridge.timing.clock import Clock, MonotonicClock
 from plant_emulator.drives.motor_node import MotorNode, is_of_drives, warm_up
+from plant_emulator.options import MotorOptions
 from protocol.errors import FwavHilError, LinkInUseError
 from protocol.scenario import NANOSECONDS, Scenario
 
@@ -25,24 +23,15 @@ LOCKSTEP_WAIT_S = 0.1
 OWN_WAIT_S = 0.001
 
 
-class MotorOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How the process runs. can: URI of the bus."""
-
-    can: str
-    protocol: str
-    out: Path | None = None
-    listen_s: float = LISTEN_S
-
-
 def run_motor(scenario: Scenario, options: MotorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
     """Be the six drives on a bus until asked to stop; returns what was counted. Raises the errors of `protocol.errors`."""
     if options.out:
         take_folder(options.out, RESULT)
-    warm_up(scenario, options.protocol)
+    warm_up(scenario, scenario.motor.protocol)
     with CanBus(options.can, scenario.motor.bitrate) as bus:
         clock = MonotonicClock()
-        _refuse_other_drives(bus, clock, options.listen_s)
-        node = MotorNode(scenario, options.protocol)
+        _refuse_other_drives(bus, clock)
+        node = MotorNode(scenario, scenario.motor.protocol)
         report({"event": "waiting", "link": options.can})
         error: FwavHilError | None = None
         try:
@@ -51,7 +40,7 @@ def run_motor(scenario: Scenario, options: MotorOptions, report: Report, stop: S
         except FwavHilError as stopped:
             error = stopped
         summary = {
-            "protocol": options.protocol,
+            "protocol": scenario.motor.protocol,
             "can": options.can,
             "counters": {**bus.counters, **node.counters},
             "error": str(error) if error else None,
@@ -75,9 +64,9 @@ def serve_once(node: MotorNode, bus: CanBus, clock: Clock) -> None:
         bus.send(cyclic)
 
 
-def _refuse_other_drives(bus: CanBus, clock: Clock, listen_s: float) -> None:
+def _refuse_other_drives(bus: CanBus, clock: Clock) -> None:
     """Raise LinkInUseError where other drives speak on the bus already."""
-    until_ns = clock.now_ns() + round(listen_s * NANOSECONDS)
+    until_ns = clock.now_ns() + round(LISTEN_S * NANOSECONDS)
     while (remaining_ns := until_ns - clock.now_ns()) > 0:
         frame = bus.recv(remaining_ns * 1e-9)
         if frame is not None and is_of_drives(frame):

@@ -15,7 +15,6 @@ from plant_emulator.tick import Emulator
 from protocol.logs.tlog import TlogWriter
 from protocol.wire.codec import Frame
 
-
 _COMMAND = Found.COMMAND
 
 

@@ -1,8 +1,7 @@
-"""What all commands share: how an error ends one, how its status reaches a user, which scenario it gets."""
+"""What all commands share: how an error ends one, and how its status reaches a user."""
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -13,12 +12,10 @@ import click
 import pytest
 from rich.console import Console
 
-from bridge import command_line
-from bridge.command_line import DurationNs, begin_process, chosen_scenario, options, run_command
+from bridge.command_line import begin_process, run_command
 from bridge.summary import show_json
 from protocol import errors
-from protocol.errors import FwavHilError, ScenarioError
-from protocol.scenario import find_scenario, load_scenario
+from protocol.errors import FwavHilError
 
 ERRORS = sorted(
     (kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, FwavHilError)),
@@ -125,103 +122,23 @@ def test_a_reader_that_left_is_no_error(
     assert capsys.readouterr().err == ""
 
 
-class TestOptions:
-    def test_they_are_listed_in_the_order_given(self, capsys: pytest.CaptureFixture[str]) -> None:
-        @click.command()
-        @options(click.option("--first"), click.option("--second"))
-        def command(**_: object) -> None: ...
-
-        run_command(command, "prog", ["--help"])
-        shown = capsys.readouterr().out
-        assert 0 < shown.index("--first") < shown.index("--second")
-
-    def test_those_between_processes_are_not_shown(self, capsys: pytest.CaptureFixture[str]) -> None:
-        @click.command()
-        @command_line.process_options
-        def command(**given: object) -> None:
-            click.echo(json.dumps(given))
-
-        assert run_command(command, "prog", ["--help"]) == 0
-        shown = capsys.readouterr().out
-        assert not [name for name in ("--status", "--core", "--with-parent") if name in shown]
-        assert run_command(command, "prog", ["--status", "jsonl", "--core", "1", "--with-parent"]) == 0
-        assert json.loads(capsys.readouterr().out) == {"status": "jsonl", "core": 1, "with_parent": True}
-
-
-class TestChosenScenario:
-    def test_by_name_and_by_path_it_is_the_same(self) -> None:
-        path = find_scenario("flapper")
-        assert chosen_scenario("flapper") == chosen_scenario(str(path)) == load_scenario(path)
-
-    def test_what_the_command_line_says_replaces_and_none_does_not(self) -> None:
-        plain = chosen_scenario("flapper")
-        chosen = chosen_scenario("flapper", rate_hz=500.0, seed=7, law=None, duration_s=None)
-        assert (chosen.rate_hz, chosen.seed) == (500.0, 7)
-        assert (chosen.law, chosen.duration_s, chosen.body) == (plain.law, plain.duration_s, plain.body)
-
-    def test_an_unknown_name_is_refused_with_those_there_are(self) -> None:
-        with pytest.raises(ScenarioError, match="there is no scenario flaper: give a file, or one of flapper, paper"):
-            chosen_scenario("flaper")
-
-    @pytest.mark.parametrize(
-        ("overrides", "place"),
-        [
-            ({"rate_hz": -1.0}, "the command line, rate_hz: "),
-            ({"rate_hz": float("nan")}, "the command line, rate_hz: "),
-            ({"rate_hz": 333.0}, "the command line: rate_hz 333 "),
-            ({"duration_s": 0.0}, "the command line, duration_s: "),
-            ({"duration_s": 1e-6}, "the command line: duration_s 1e-06 "),
-            ({"seed": -1}, "the command line, seed: "),
-        ],
-    )
-    def test_what_makes_no_sense_is_blamed_on_the_command_line(self, overrides: dict[str, Any], place: str) -> None:
-        with pytest.raises(ScenarioError) as caught:
-            chosen_scenario("flapper", **overrides)
-        assert str(caught.value).startswith(place)
-
-    def test_a_mistake_in_a_file_is_blamed_on_the_file(self, tmp_path: Path) -> None:
-        path = tmp_path / "mine.toml"
-        path.write_text(find_scenario("flapper").read_text(encoding="utf-8").replace("mass =", "mas ="))
-        with pytest.raises(ScenarioError) as caught:
-            chosen_scenario(str(path))
-        assert str(caught.value) == f"{path}: unknown key 'body.mas': did you mean 'mass'?"
-
-
-@pytest.fixture
-def calls(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[object]]:
-    """What `begin_process` would do to this process beyond its signals, which are given back afterwards."""
-    done: list[object] = []
-    monkeypatch.setattr(command_line, "end_with_parent", lambda: done.append("with parent"))
-    monkeypatch.setattr(command_line, "sit_on_core", done.append)
+@pytest.fixture(autouse=True)
+def signals_come_back() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
-    yield done
+    yield
     for number, handler in before.items():
         signal.signal(number, handler)
 
 
 class TestBeginProcess:
-    def test_alone_it_only_listens_to_signals(self, calls: list[object]) -> None:
-        _, stop = begin_process("text", None, with_parent=False)
-        assert calls == []
+    def test_it_listens_to_signals(self) -> None:
+        _, stop = begin_process()
         assert not stop.requested
         signal.raise_signal(signal.SIGTERM)
         assert stop.requested
 
-    def test_core_0_is_a_core(self, calls: list[object]) -> None:
-        begin_process("text", 0, with_parent=True)
-        assert calls == ["with parent", 0]
-
-    def test_for_a_parent_it_reports_in_json(self, calls: list[object], capsys: pytest.CaptureFixture[str]) -> None:
-        report, _ = begin_process("jsonl", None, with_parent=False)
-        report({"event": "waiting", "link": "mem://x"})
-        captured = capsys.readouterr()
-        assert json.loads(captured.out) == {"event": "waiting", "link": "mem://x"}
-        assert captured.err == ""
-
-    def test_for_a_person_it_reports_in_words_beside_the_results(
-        self, calls: list[object], capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        report, _ = begin_process("text", None, with_parent=False)
+    def test_for_a_person_it_reports_in_words_beside_the_results(self, capsys: pytest.CaptureFixture[str]) -> None:
+        report, _ = begin_process()
         report({"event": "waiting", "link": "udpin://127.0.0.1:14560"})
         report({"event": "started", "peer": "127.0.0.1:5"})
         report({"event": "progress", "t_ns": 10**9, "q": [0.0] * 6})  # on a terminal only
@@ -233,23 +150,3 @@ class TestBeginProcess:
             "started with 127.0.0.1:5",
             "ended; sent 3, bad_crc 2",
         ]
-
-
-class TestDuration:
-    @pytest.mark.parametrize(
-        ("text", "expected_ns"),
-        [("5ms", 5_000_000), ("250us", 250_000), ("0.1s", 100_000_000), (".5ms", 500_000), ("7ns", 7), ("0s", 0),
-         ("1.5us", 1500), (" 1s ", 1_000_000_000), ("1.s", 1_000_000_000)],
-    )  # fmt: skip
-    def test_a_number_and_its_unit(self, text: str, expected_ns: int) -> None:
-        assert DurationNs().convert(text, None, None) == expected_ns
-
-    @pytest.mark.parametrize("text", ["", "5", "ms", "-5ms", "5 ms", "5min", "nans", "1e-3s", "5msx", "five ms", "٥ms"])
-    def test_anything_else_names_the_remedy(self, text: str) -> None:
-        with pytest.raises(click.BadParameter, match="5ms, 250us"):
-            DurationNs().convert(text, None, None)
-
-    @pytest.mark.parametrize("text", ["1.001s", "1001ms", "9" * 400 + "s"])
-    def test_more_than_a_second_is_refused(self, text: str) -> None:
-        with pytest.raises(click.BadParameter, match="more than a second"):
-            DurationNs().convert(text, None, None)

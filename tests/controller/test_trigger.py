@@ -13,7 +13,7 @@ from bridge.links.memory import memory_pair
 from bridge.process import StopFlag
 from bridge.timing.clock import VirtualClock
 from controller.laws.law import make_law
-from controller.options import ControllerOptions
+from controller.options import ControllerOptions, Trigger
 from controller.process import Controller, warm_up
 from protocol.errors import PeerLostError
 from protocol.wire import mapping
@@ -53,7 +53,7 @@ class Timed(Link):
 
 
 def serve(
-    arrivals_ns: Callable[[FrameWriter], list[tuple[int, bytes]]], *, trigger: str, spin_ns: int = 0
+    arrivals_ns: Callable[[FrameWriter], list[tuple[int, bytes]]], *, trigger: Trigger, spin_ns: int = 0
 ) -> tuple[Controller, Timed]:
     """Have a controller answer samples that come at given times, until the emulator says that it ends."""
     law = make_law("ude", SCENARIO)
@@ -160,7 +160,7 @@ def test_the_newest_sample_counts_and_a_repeated_one_is_none() -> None:
 
 
 @pytest.mark.parametrize("trigger", ["sample", "clock"])
-def test_three_seconds_of_silence_end_it(trigger: str) -> None:
+def test_three_seconds_of_silence_end_it(trigger: Trigger) -> None:
     with pytest.raises(PeerLostError, match="fell silent for 3 s"):
         serve(lambda writer: [(3 * PERIOD_NS + 1000, sample(writer, 0))], trigger=trigger)
 

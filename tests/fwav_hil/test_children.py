@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import textwrap
@@ -14,11 +15,19 @@ import pytest
 
 from fwav_hil import children
 from fwav_hil.children import Child, listen
+from fwav_hil.jobs import Job
+from plant_emulator.options import MotorOptions
+from tests.loop import scenario_of
 
 Start: TypeAlias = Callable[..., Child]
+JOB = Job(scenario_of("flapper"), MotorOptions(can="virtual:tiny"))
 FOREVER_S = 300
 PATIENCE_S = 60.0
-REPORT = "import json, os, signal, sys, time\ndef report(**event): print(json.dumps(event), flush=True)\n"
+REPORT = """
+import json, os, signal, sys, time
+def report(**event): print(json.dumps(event), flush=True)
+job = json.loads(sys.stdin.readline())
+"""
 WAIT_FOR_EVER = f"report(event='ready')\ntime.sleep({FOREVER_S})"
 
 
@@ -30,9 +39,9 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
     monkeypatch.setattr(children, "_GRACE_S", PATIENCE_S)
     begun: list[Child] = []
 
-    def begin(code: str, *arguments: str, module: str = "tiny_one") -> Child:
+    def begin(code: str, module: str = "tiny_one") -> Child:
         (tmp_path / f"{module}.py").write_text(REPORT + textwrap.dedent(code))
-        child = Child(module, list(arguments))
+        child = Child(module, JOB, module)
         begun.append(child)
         return child
 
@@ -76,9 +85,9 @@ class TestListening:
         events: list[tuple[str, str]] = []
         for child, event in listen([one, other]):
             if child:
-                events.append((child.module, event["event"]))
+                events.append((child.name, event["event"]))
                 if event["event"] == "hello":
-                    assert Path(event["of"]).stem == child.module
+                    assert Path(event["of"]).stem == child.name
                     (one if child is other else other).tell("go on")
                 else:
                     assert event["line"] == "go on\n"
@@ -86,9 +95,9 @@ class TestListening:
             (name, kind) for name in ("tiny_one", "tiny_other") for kind in ("hello", "told")
         )
 
-    def test_it_gets_its_arguments_and_what_makes_it_a_child(self, start: Start) -> None:
-        child = start("report(event=sys.argv[1:])", "a.toml", "--wait", "3")
-        assert hear(child) == [(child, {"event": ["a.toml", "--wait", "3", "--status", "jsonl", "--with-parent"]})]
+    def test_it_gets_its_order_first(self, start: Start) -> None:
+        child = start("report(event=sys.argv[1:], told=job)")
+        assert hear(child) == [(child, {"event": ["tiny_one"], "told": json.loads(JOB.encode())})]
 
     def test_silence_gives_the_listener_time_to_look_around(self, start: Start) -> None:
         child = start("sys.stdin.readline()\nreport(event='woken')")

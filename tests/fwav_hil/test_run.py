@@ -24,7 +24,7 @@ import pytest
 
 import fwav_hil.run
 from bridge.timing.clock import MonotonicClock
-from fwav_hil.run import RunOptions
+from fwav_hil.options import RunOptions
 from fwav_hil.simulate import simulate
 from fwav_hil.studies.margin import budget_line
 from plant_emulator.plant.truth import load_truth
@@ -72,11 +72,19 @@ def started(*arguments: str | Path, cwd: Path) -> Iterator[subprocess.Popen[str]
         process.communicate()
 
 
-def processes_of(folder: Path) -> dict[str, int]:
-    """The emulator and controller processes that work for a run folder: module -> process id."""
+def processes_of(cwd: Path) -> dict[str, int]:
+    """The processes of a run that was started in a folder: name -> process id."""
     listed = subprocess.run(["ps", "-ww", "-eo", "pid,args"], capture_output=True, text=True, check=True).stdout
-    found = re.findall(r"^\s*(\d+) .* -m (plant_emulator|controller) (.*)$", listed, re.MULTILINE)
-    return {module: int(pid) for pid, module, arguments in found if str(folder) in arguments}
+    found = re.findall(r"^\s*(\d+) .* -m fwav_hil.jobs (\w+)$", listed, re.MULTILINE)
+    return {name: int(pid) for pid, name in found if working_folder(pid) == cwd.resolve()}
+
+
+def working_folder(pid: str) -> Path | None:
+    """Of a process; None where it has ended."""
+    try:
+        return Path(f"/proc/{pid}/cwd").readlink()
+    except (FileNotFoundError, ProcessLookupError, PermissionError):
+        return None
 
 
 def wait_until(condition: Any) -> None:
@@ -203,11 +211,11 @@ def test_a_run_is_two_processes_and_a_tcp_link_serves_as_well(tmp_path: Path) ->
         "--no-plots",
     )
     with started(*arguments, cwd=tmp_path) as run:
-        wait_until(lambda: len(processes_of(folder)) == 2)
-        pids = set(processes_of(folder).values())
+        wait_until(lambda: len(processes_of(tmp_path)) == 2)
+        pids = set(processes_of(tmp_path).values())
         assert len(pids | {run.pid}) == 3
         assert run.wait(PATIENCE_S) == 0
-    assert not processes_of(folder)
+    assert not processes_of(tmp_path)
 
 
 def test_real_time_follows_too(tmp_path: Path) -> None:
@@ -258,12 +266,12 @@ def test_a_killed_process_ends_the_run_and_leaves_no_orphan(victim: str, tmp_pat
     folder = tmp_path / "run"
     arguments = ("run", "--speed", "1", "--duration", "60", "--link", FREE, "--out", folder, "--no-plots")
     with started(*arguments, cwd=tmp_path) as run:
-        wait_until(lambda: (folder / "run.tlog").exists() and len(processes_of(folder)) == 2 and flying(folder))
-        os.kill(processes_of(folder)[victim], signal.SIGKILL)
+        wait_until(lambda: (folder / "run.tlog").exists() and len(processes_of(tmp_path)) == 2 and flying(folder))
+        os.kill(processes_of(tmp_path)[victim], signal.SIGKILL)
         _, errors = run.communicate(timeout=PATIENCE_S)
         assert run.returncode not in (0, None)
     assert_one_line(errors, victim.replace("_", " "), "signal 9")
-    assert not processes_of(folder)
+    assert not processes_of(tmp_path)
     assert (folder / "run.tlog").stat().st_size > 0
     assert (folder / "scenario.toml").exists()
 
@@ -273,7 +281,7 @@ def test_an_interrupted_run_keeps_what_it_recorded(number: signal.Signals, tmp_p
     folder = tmp_path / "run"
     arguments = ("run", "--speed", "1", "--duration", "60", "--link", FREE, "--out", folder, "--no-plots")
     with started(*arguments, cwd=tmp_path) as run:
-        wait_until(lambda: len(processes_of(folder)) == 2 and flying(folder))
+        wait_until(lambda: len(processes_of(tmp_path)) == 2 and flying(folder))
         if number == signal.SIGINT:
             os.killpg(run.pid, number)  # as a terminal does on Ctrl-C
         else:
@@ -281,7 +289,7 @@ def test_an_interrupted_run_keeps_what_it_recorded(number: signal.Signals, tmp_p
         _, errors = run.communicate(timeout=PATIENCE_S)
         assert run.returncode == 130
     assert_one_line(errors, "interrupted", str(folder))
-    assert not processes_of(folder)
+    assert not processes_of(tmp_path)
     summary = json.loads((folder / "summary.json").read_text())
     assert len(load_truth(folder / "ground_truth.npy")) == summary["ticks"] > 0
 
@@ -290,10 +298,10 @@ def test_the_processes_end_with_a_run_that_is_killed(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     arguments = ("run", "--speed", "1", "--duration", "60", "--link", FREE, "--out", folder, "--no-plots")
     with started(*arguments, cwd=tmp_path) as run:
-        wait_until(lambda: len(processes_of(folder)) == 2 and flying(folder))
+        wait_until(lambda: len(processes_of(tmp_path)) == 2 and flying(folder))
         run.kill()
         run.wait(PATIENCE_S)
-        wait_until(lambda: not processes_of(folder))
+        wait_until(lambda: not processes_of(tmp_path))
 
 
 def flying(folder: Path) -> bool:

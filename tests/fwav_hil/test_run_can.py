@@ -24,7 +24,7 @@ from protocol.motors.can_stuffing import exact_bits
 from protocol.scenario import find_scenario
 from tests.bridge.motor_bus.test_can_bus import free_group
 from tests.dbc import published_odrive_dbc
-from tests.fwav_hil.test_run import FREE, PATIENCE_S, assert_one_line, call, flying, started, wait_until
+from tests.fwav_hil.test_run import FREE, PATIENCE_S, assert_one_line, call, flying, processes_of, started, wait_until
 from tests.loop import scenario_of
 
 pytestmark = [pytest.mark.processes, pytest.mark.timeout(150)]
@@ -38,13 +38,6 @@ def compiled_kernels() -> None:
     compile_kernels(scenario)
     warm_up(scenario, "odrive")
     exact_bits(CanFrame(0))
-
-
-def drives_of(place: str) -> int | None:
-    """The process id of the drives that work for a folder or bus."""
-    listed = subprocess.run(["ps", "-ww", "-eo", "pid,args"], capture_output=True, text=True, check=True).stdout
-    found = re.findall(r"^\s*(\d+) .* -m plant_emulator.drives.motor_command (.*)$", listed, re.MULTILINE)
-    return next((int(pid) for pid, arguments in found if place in arguments), None)
 
 
 def test_three_processes_fly_as_the_simulation_does(tmp_path: Path) -> None:
@@ -62,7 +55,7 @@ def test_three_processes_fly_as_the_simulation_does(tmp_path: Path) -> None:
     result = json.loads((tmp_path / "r.json").read_text())
     assert result["can"]["protocol"] == "odrive"
     assert result["counters"]["motor"]["syncs"] == 100
-    assert drives_of(str(tmp_path)) is None
+    assert "motor" not in processes_of(tmp_path)
     messages = [CanFrame(m.arbitration_id, bytes(m.data)) for m in can.LogReader(tmp_path / "bus.log")]
     assert len(messages) > 13 * 100
     assert any(is_of_drives(frame) for frame in messages)
@@ -81,10 +74,9 @@ def test_a_killed_motor_process_is_a_counted_outage_a_safe_output_and_a_recovery
     with started("run", "flapper", "--motor", "can", "--can", free_group(), "--duration", "5", "--link", FREE,
                  "--out", folder, "--no-plots", cwd=tmp_path) as run:  # fmt: skip
         wait_until(lambda: flying(folder))
-        first = drives_of(str(folder))
-        assert first is not None
+        first = processes_of(tmp_path)["motor"]
         os.kill(first, signal.SIGKILL)
-        wait_until(lambda: drives_of(str(folder)) not in (None, first))
+        wait_until(lambda: processes_of(tmp_path).get("motor", first) != first)
         _, errors = run.communicate(timeout=2 * PATIENCE_S)
     assert run.returncode == 0, errors
     assert "the motor process was ended by signal 9: started again (1 of 3)" in errors
@@ -97,7 +89,7 @@ def test_a_killed_motor_process_is_a_counted_outage_a_safe_output_and_a_recovery
     assert counters["motor_outages"] + counters["motor_safe_ticks"] >= 1
     if counters["motor_outages"]:
         assert np.all(truth["u"] == 0.0, axis=1).sum() >= counters["motor_outage_ticks"]
-    assert drives_of(str(folder)) is None
+    assert "motor" not in processes_of(tmp_path)
 
 
 def test_a_rate_that_does_not_fit_is_refused_before_anything_starts(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from bridge.links.link import open_link
 from bridge.links.memory import memory_pair
+from bridge.shared_options import ClockMode
 from plant_emulator.options import MotorLink
 from plant_emulator.plant.truth import load_truth
 from protocol.logs.tlog import read_tlog
@@ -65,7 +66,7 @@ def test_the_controller_is_none_the_wiser_and_the_log_is_the_same_each_time(tmp_
 
 
 @pytest.mark.parametrize("clock", ["lockstep", "realtime"])
-def test_a_peer_on_the_loops_link_asks_and_is_answered_there(clock: str, tmp_path: Path) -> None:
+def test_a_peer_on_the_loops_link_asks_and_is_answered_there(clock: ClockMode, tmp_path: Path) -> None:
     near, far = memory_pair()
     # The controller's end carries a station's words too, as a router in between would.
     asks = {

@@ -16,6 +16,7 @@ from bridge.links.memory import memory_pair
 from bridge.process import StopFlag
 from bridge.recording.ring_recorder import RingRecorder
 from bridge.recording.sidecar import read_sidecar
+from bridge.shared_options import OnLogError
 from controller.laws.law import make_law
 from controller.options import ControllerOptions
 from controller.process import serve
@@ -51,7 +52,7 @@ def unlimited(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-def fly_on_small_disk(folder: Path, on_log_error: str) -> tuple[dict[str, Any] | FwavHilError, list[str]]:
+def fly_on_small_disk(folder: Path, on_log_error: OnLogError) -> tuple[dict[str, Any] | FwavHilError, list[str]]:
     """The emulator's summary or error, and its warnings."""
     ours, theirs = memory_pair()
     law, stop, warnings = make_law("ude", SCENARIO), StopFlag(), list[str]()

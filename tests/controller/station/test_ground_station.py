@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import common
 from bridge.endpoint import Endpoint
 from bridge.links.link import open_link
 from bridge.links.memory import memory_pair
+from bridge.shared_options import ClockMode
 from bridge.station import Station
 from bridge.timing.clock import VirtualClock
 from controller.laws.law import make_law
@@ -117,7 +118,7 @@ def test_nothing_is_set_while_armed() -> None:
 
 
 @pytest.mark.parametrize("clock", ["lockstep", "realtime"])
-def test_a_station_arms_a_controller_that_waits_for_it(clock: str, tmp_path: Path) -> None:
+def test_a_station_arms_a_controller_that_waits_for_it(clock: ClockMode, tmp_path: Path) -> None:
     near, far = memory_pair()
     uri = f"mem://vehicle{next(_names)}"
     short = scenario_of("flapper", duration_s=0.4)

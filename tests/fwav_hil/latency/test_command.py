@@ -19,7 +19,7 @@ from bridge.command_line import run_command
 from bridge.latency.responder import respond
 from bridge.latency.segments import CONTROLLER_FILE, EMULATOR_FILE, load_legs
 from bridge.links.faults import DelayedLink
-from bridge.links.link import open_link
+from bridge.links.link import counterpart, open_link
 from bridge.links.memory import memory_pair
 from bridge.process import StopFlag
 from bridge.timing.clock import MonotonicClock
@@ -104,7 +104,7 @@ def test_a_study_gives_a_table_json_histograms_and_a_plot(tmp_path: Path) -> Non
         assert rows[-1][2] == result["legs_us"][name]["count"]
     assert (tmp_path / result["files"]["plot"]).read_bytes().startswith(b"\x89PNG")
     assert json.loads((tmp_path / "run" / "latency.json").read_text()) == result
-    assert not processes_of(tmp_path / "run")
+    assert not processes_of(tmp_path)
 
     again = call("latency", "flapper", "--duration", "0.6", "--out", "run", cwd=tmp_path)
     assert again.returncode == 6
@@ -116,7 +116,7 @@ def test_a_study_gives_a_table_json_histograms_and_a_plot(tmp_path: Path) -> Non
 def test_a_study_that_is_interrupted_keeps_what_it_has(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with started("latency", "flapper", "--duration", "60", "--out", folder, cwd=tmp_path) as study:
-        wait_until(lambda: len(processes_of(folder)) == 2 and flying(folder))
+        wait_until(lambda: len(processes_of(tmp_path)) == 2 and flying(folder))
         os.killpg(study.pid, signal.SIGINT)  # as a terminal does on Ctrl-C
         said, errors = study.communicate(timeout=LONG_PATIENCE_S)
         assert study.returncode == 130
@@ -124,7 +124,7 @@ def test_a_study_that_is_interrupted_keeps_what_it_has(tmp_path: Path) -> None:
     assert "age: stamped -> applied" in said, "what there is of it is reported"
     assert (folder / EMULATOR_FILE).exists()
     assert (folder / CONTROLLER_FILE).exists()
-    assert not processes_of(folder)
+    assert not processes_of(tmp_path)
 
 
 class TestInterruptedProbes:
@@ -315,7 +315,7 @@ class TestARealLink:
         with open_link("udpin://127.0.0.1:0") as link:
             thread = threading.Thread(target=respond, args=(link, stop))
             thread.start()
-            yield link.uri.replace("udpin", "udpout")
+            yield counterpart(link.uri)
             stop.requested = True
             thread.join(PATIENCE_S)
 

@@ -22,7 +22,8 @@ from bridge.timing.clock import VirtualClock
 from bridge.timing.realtime import Setting
 from fwav_hil.logs.choice import Choice, choose_frames, open_telemetry
 from fwav_hil.replay.keyboard import Keyboard
-from fwav_hil.replay.to_link import Replay, ReplayOptions
+from fwav_hil.replay.options import ReplayOptions
+from fwav_hil.replay.to_link import Replay
 from protocol.logs.tlog import read_tlog
 from protocol.wire import mapping
 from protocol.wire.codec import FrameReader
@@ -146,9 +147,9 @@ class TestOtherDialects:
         (tmp_path / "a.tlog").write_bytes(b"".join(record.data for record in records))
         log, scan = open_telemetry(tmp_path / "a.tlog")
         near, far = memory_pair()
-        how = ReplayOptions(speed=None, rewrite_time=True)
+        how = ReplayOptions(speed=None, rewrite_time=True, key=KEY)
         with near, far:
-            replay = Replay(scan, choose_frames(log, scan, Choice()), near, how, VirtualClock(), StopFlag(), KEY)
+            replay = Replay(scan, choose_frames(log, scan, Choice()), near, how, VirtualClock(), StopFlag())
             counters = replay.run()["counters"]
             sent = [far.recv(0.0) for _ in records]
         assert [sent[n] for n in range(0, 90, 3)] == [records[n].frame for n in range(0, 90, 3)]
@@ -191,8 +192,8 @@ class TestTrouble:
             (("--to", "udpout://127.0.0.1:9", "--from", "99"), "no time of"),
             (("--to", "udpout://127.0.0.1:9", "--system", "9"), "no frame of"),
             (("--to", "carrier://pigeon"), "names no link"),
-            (("--into", "controller", "--from", "2", "--loop"), "--from, --loop: for replays to a link (--to URI)"),
-            (("--to", "udpout://127.0.0.1:9", "--fast", "--law", "pd"), "--law, --fast: for replays --into"),
+            (("--into", "controller", "--from", "2", "--loop"), "--from does nothing without --to"),
+            (("--to", "udpout://127.0.0.1:9", "--fast", "--law", "pd"), "--law does nothing without --into"),
             (("--to", "udpout://127.0.0.1:9", "--from", "0.4", "--types", "HEARTBEAT", "--loop"), "--loop: all frames"),
             (("--into", "controller", "--realtime"), "--realtime is about keeping the time of a log"),
             (("--to", "udpout://127.0.0.1:9", "--realtime", "--speed", "max"), "--realtime is about keeping the time"),

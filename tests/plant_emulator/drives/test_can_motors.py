@@ -17,6 +17,7 @@ from bridge.links.memory import memory_pair
 from bridge.motor_bus.can_bus import CanBus
 from bridge.motor_bus.can_load import plan_bus
 from bridge.process import StopFlag
+from bridge.shared_options import ClockMode
 from bridge.timing.clock import MonotonicClock
 from fwav_hil.bus_plot import plot_bus, read_encoders
 from fwav_hil.score import scores
@@ -48,7 +49,7 @@ def short(**motor: Any) -> Scenario:
     return msgspec.structs.replace(with_motor(**({"lag_s": 0.0} | motor)), duration_s=0.4)
 
 
-def fly(scenario: Scenario, out: Path, motors: MotorLink, clock: str = "lockstep") -> dict[str, Any]:
+def fly(scenario: Scenario, out: Path, motors: MotorLink, clock: ClockMode = "lockstep") -> dict[str, Any]:
     near, far = memory_pair()
     with near, far:
         ends = fly_both(scenario, near, far, out, motors=motors, clock=clock)

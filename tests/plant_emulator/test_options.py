@@ -28,7 +28,7 @@ def test_without_a_bus_they_are_refused(
     assert run_command(cli, "fwav-hil", [command, "flapper", *option, *direct, "--out", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert f"{option[0]} is of drives on a CAN bus: add --motor can" in said
+    assert f"{option[0]} does nothing without --motor can: add that" in said
     assert not (tmp_path / "run").exists()
 
 
