@@ -5,6 +5,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+EXTRAS := can,logs,plots,studies,dev
 
 .PHONY: run test check lint types layers bench clean
 .DELETE_ON_ERROR:
@@ -33,9 +34,11 @@ bench: $(READY)
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	    { echo "fwav-hil needs Python 3.11 or newer: call make with PYTHON=python3.12, say" >&2; exit 1; }
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	touch $@
+	@echo "making the environment $(VENV) (some seconds)"
+	@$(PYTHON) -m venv $(VENV)
+	@echo "installing into it what constraints.txt lists (1 GB; the first time one to three minutes, nothing is shown meanwhile)"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS)]'
+	@touch $@
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

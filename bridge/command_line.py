@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from bridge.extras import remedy
 from bridge.links.link import Medium, scheme_of
 from bridge.process import StopFlag
 from bridge.reporting import Report
@@ -75,6 +76,11 @@ def run_command(command: click.Command, name: str, arguments: Sequence[str] | No
         # Whoever read our output has left: click and rich then exit with 1. Hand the interpreter a place to flush to.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except ModuleNotFoundError as error:
+        if (sentence := remedy(error)) is None:
+            raise
+        click.echo(f"{name}: {sentence}", err=True)
+        return UsageError.exit_code
     except OSError as error:
         # Files have named errors of their own; what is left is the output itself, on a full disk, say.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import click
 
+from bridge.extras import left_out_if_missing
 from bridge.option_types import EXISTING_FOLDER, check_speed
 from bridge.options import Argument, Option, command
 from bridge.shared_options import JsonPath, Plots, ScenarioChoice, folder_option
@@ -192,19 +193,26 @@ def _finish(folder: Path, json_path: Path | None, *, plots: bool) -> None:
         click.echo(f"run folder: {folder} (it holds no tick)", err=is_stdout(json_path))
         return
     if plots:
-        from fwav_hil.plots import plot_run
-        from plant_emulator.plant.truth import load_truth
-        from protocol.scenario import load_scenario
-
-        scenario = load_scenario(folder / FILES["scenario"])
-        title = f"{summary['scenario']}, {summary['law']}, {summary['rate_hz']:g} Hz"
-        drawn = plot_run(folder, scenario, load_truth(folder / FILES["ground_truth"]), title)
-        if (folder / FILES["can_log"]).exists():
-            from fwav_hil.bus_plot import plot_bus
-
-            drawn["hysteresis_bus"] = plot_bus(folder / FILES["can_log"], scenario, title)
-        summary["files"] |= {name: str(file) for name, file in drawn.items()}
-        write_json(path, summary)
+        with left_out_if_missing("plots"):
+            summary["files"] |= _draw(folder, summary)
+            write_json(path, summary)
     print_summary(summary, to_stderr=is_stdout(json_path))
     click.echo(f"run folder: {folder}", err=is_stdout(json_path))
     show_json(json_path, summary)
+
+
+def _draw(folder: Path, summary: dict[str, Any]) -> dict[str, str]:
+    """Draw the plots of a run; name -> file."""
+    from fwav_hil.plots import plot_run
+    from fwav_hil.run_folder import FILES
+    from plant_emulator.plant.truth import load_truth
+    from protocol.scenario import load_scenario
+
+    scenario = load_scenario(folder / FILES["scenario"])
+    title = f"{summary['scenario']}, {summary['law']}, {summary['rate_hz']:g} Hz"
+    drawn = plot_run(folder, scenario, load_truth(folder / FILES["ground_truth"]), title)
+    if (folder / FILES["can_log"]).exists():
+        from fwav_hil.bus_plot import plot_bus
+
+        drawn["hysteresis_bus"] = plot_bus(folder / FILES["can_log"], scenario, title)
+    return {name: str(file) for name, file in drawn.items()}

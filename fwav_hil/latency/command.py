@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from bridge.extras import require
 from bridge.links.link import scheme_of
 from bridge.option_types import EXISTING_FOLDER
 from bridge.options import Option, command, given_options
@@ -63,6 +64,7 @@ def latency(
     """Measure where the time goes between a sample and its command, in the real-time closed loop or on a real link."""
     from fwav_hil.tables import plain_console
 
+    require("plots", "studies")
     to_stderr = is_stdout(json_path)
     terminal = (sys.stderr if to_stderr else sys.stdout).isatty()
     console = plain_console(to_stderr=to_stderr, width=None if terminal else 120)

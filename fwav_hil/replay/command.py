@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import click
 
 from bridge.command_line import begin_process
+from bridge.extras import left_out_if_missing
 from bridge.option_types import EXISTING
 from bridge.options import Argument, Option, command
 from bridge.shared_options import JsonPath
@@ -113,7 +114,8 @@ def _replay_into(log: Path, into: str, options: IntoOptions, wait_s: float, json
     if not difference.is_zero and len(difference.t_ns):
         folder = _report_folder(options.out, f"replay-{run.scenario.name}-{run.scenario.law}")
         if options.plots:
-            plot_difference(difference, title, folder / "difference.png")
+            with left_out_if_missing("plot"):
+                plot_difference(difference, title, folder / "difference.png")
         write_json(folder / "difference.json", result)
         click.echo(f"report: {folder}", err=is_stdout(json_path))
     show_json(json_path, result)

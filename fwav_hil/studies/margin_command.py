@@ -9,6 +9,7 @@ from typing import Annotated
 import click
 import msgspec
 
+from bridge.extras import require
 from bridge.options import Except, Option, command
 from bridge.shared_options import JsonPath, ScenarioChoice, folder_option
 from bridge.summary import is_stdout, make_folder, show_json, write_json
@@ -56,6 +57,7 @@ def margin_command(
     if n_filter is not None:
         scenario = with_derivative_pole(scenario, n_filter)
     if out:
+        require("plots")
         if (out / RESULT).exists():
             raise RunFolderError(f"{out} holds a margin study already, which stays: choose another folder with --out")
         make_folder(out)
