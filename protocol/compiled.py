@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import functools
 import importlib
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, TypeAlias, TypeVar, cast
 
 import numba
 import numpy as np
 import numpy.typing as npt
+from numba.core import caching
 
-from protocol.kernel_cache import cache_folder
+from protocol.kernel_cache import kernel_folder
 
 Packed: TypeAlias = npt.NDArray[np.void]
 """A structured array of shape (1,), as `pack` makes them."""
@@ -40,7 +44,7 @@ _load_numpy_support()
 
 
 def compiled(function: Kernel) -> Kernel:
-    """Compile `function` with numba when it is first called, and keep the result in the cache of these sources.
+    """Compile `function` with numba when it is first called, and keep the result in the cache (`kernel_cache`).
 
     No fast-math: the same expression must give the same bits in the control process and in `simulate`.
     """
@@ -56,13 +60,64 @@ def inlined(function: Kernel) -> Kernel:
 
 
 def _compile(function: Kernel, *, forceinline: bool) -> Kernel:
-    config: Any = numba.config
-    place = config.CACHE_DIR
-    config.CACHE_DIR = str(cache_folder())  # read by numba while it decorates, and nowhere later
-    try:
-        return cast("Kernel", numba.njit(cache=True, error_model="numpy", forceinline=forceinline)(function))
-    finally:
-        config.CACHE_DIR = place
+    kernel: Any = numba.njit(error_model="numpy", forceinline=forceinline)(function)
+    make_cache: Any = _Cache
+    kernel._cache = make_cache(function)  # what `cache=True` sets, with folders of our own
+    return cast("Kernel", kernel)
+
+
+class _Locator(caching._CacheLocator):
+    """Where the machine code of one function lies: in the folder of its module's key, so it is never stale."""
+
+    def __init__(self, function: Callable[..., Any], file: str) -> None:
+        self._folder = kernel_folder(function.__module__, file)
+        self._line = function.__code__.co_firstlineno
+        self._py_file = file  # numba names it in warnings
+
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], file: str) -> _Locator | None:
+        return cls(function, file) if Path(file).exists() else None
+
+    def ensure_cache_path(self) -> None:
+        self._folder.mkdir(mode=0o700, exist_ok=True)  # another process may have tidied it up
+
+    def get_cache_path(self) -> str:
+        return str(self._folder)
+
+    def get_source_stamp(self) -> str:
+        return self._folder.name
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+
+class _Implementation(caching.CompileResultCacheImpl):
+    _locator_classes: list[type[object]] = [_Locator]  # noqa: RUF012  # as numba declares it
+
+
+class _Cache(caching.FunctionCache):
+    """numba's cache of one function; it bears with damaged entries, full disks, and processes that compile at once."""
+
+    _impl_class = _Implementation
+
+    def load_overload(self, signature: Any, target: Any) -> Any:
+        load: Any = super().load_overload
+        flush: Any = self.flush
+        try:
+            return load(signature, target)
+        except Exception:  # noqa: BLE001  # whatever unpickling raises: the machine lost power while it was written, say
+            with contextlib.suppress(OSError):
+                flush()
+            return None
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        save: Any = super().save_overload
+        with contextlib.suppress(OSError):  # what cannot be kept is compiled again
+            self._impl.locator.ensure_cache_path()
+            with (Path(self.cache_path) / "lock").open("w") as lock:
+                with contextlib.suppress(OSError):  # there are network file systems without locks
+                    fcntl.flock(lock, fcntl.LOCK_EX)  # two that add to one index at a time could choose the same name
+                save(signature, result)
 
 
 @functools.cache

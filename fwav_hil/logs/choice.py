@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from fwav_hil.logs.working import Working
 from protocol.errors import LogError, UsageError
-from protocol.kernel_cache import cache_folder
+from protocol.kernel_cache import kernels_are_warm, mark_warm
 from protocol.logs.dialect import layouts_by_name
 from protocol.logs.files import Log, Sender, chosen_rows, open_log
 from protocol.logs.scan import Scan
@@ -41,12 +41,11 @@ def log_file(path: Path) -> Path:
 
 def open_with_progress(path: Path) -> Log:
     """`open_log` of a log or of a run folder's, telling how far it is. Raises LogError."""
-    warm = cache_folder() / "warm-logs"
-    if not warm.exists():
-        click.echo("compiling the log reader (once after each installation, some ten seconds) ...", err=True)
+    if not kernels_are_warm("protocol.logs"):
+        click.echo("compiling the log reader (after an installation or an edit of it, some ten seconds) ...", err=True)
     with Working(f"reading {log_file(path).name}") as working:
         log = open_log(log_file(path), progress=working)
-    warm.touch()
+    mark_warm("protocol.logs")
     return log
 
 

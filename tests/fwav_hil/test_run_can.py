@@ -16,11 +16,10 @@ import pytest
 
 from fwav_hil.compile import compile_kernels
 from fwav_hil.simulate import simulate
-from plant_emulator.drives.motor_node import is_of_drives, warm_up
+from plant_emulator.drives.motor_node import is_of_drives
 from plant_emulator.plant.truth import load_truth
 from protocol.can_frame import CanFrame
 from protocol.motors import simulation_sync
-from protocol.motors.can_stuffing import exact_bits
 from protocol.scenario import find_scenario
 from tests.bridge.motor_bus.test_can_bus import free_group
 from tests.dbc import published_odrive_dbc
@@ -34,10 +33,7 @@ FLAPPER = "flapper"
 @pytest.fixture(scope="module", autouse=True)
 def compiled_kernels() -> None:
     """Compile once, so that no bound of a test is spent on it."""
-    scenario = scenario_of("flapper")
-    compile_kernels(scenario)
-    warm_up(scenario, "odrive")
-    exact_bits(CanFrame(0))
+    compile_kernels(scenario_of("flapper"))
 
 
 def test_three_processes_fly_as_the_simulation_does(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import importlib.util
 import itertools
 import shutil
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,16 +16,36 @@ from protocol import compiled, kernel_cache
 _COPIED = (compiled, kernel_cache)
 _numbers = itertools.count()
 
+KERNEL = "from protocol.compiled import compiled\n"
+SOURCES = {
+    "protocol.rotations": KERNEL,
+    "plant_emulator.plant.body": f"{KERNEL}from protocol.rotations import turn\n",
+    "plant_emulator.tick": f"{KERNEL}import plant_emulator.plant.body as body\n",
+    "controller.laws.law": KERNEL,
+    "controller.process": "from controller.laws import law\n",
+    "fwav_hil.cli": "from controller import process\n",
+}
+"""A project in small: rotations are used by the body, which the emulator's tick uses; the law does without."""
 
-def make_tree(root: Path) -> Path:
-    """A project with one source in each package, and copies of the modules under test."""
+
+def make_tree(root: Path, sources: Mapping[str, str] = SOURCES) -> Path:
+    """A project of these modules, and copies of the modules under test."""
     for package in kernel_cache.PACKAGES:
-        (root / package / "deep").mkdir(parents=True)
+        (root / package).mkdir(parents=True)
         (root / package / "__init__.py").touch()
-        (root / package / "deep" / "kernel.py").write_text("ANSWER = 41\n")
-    for module in _COPIED:
-        shutil.copy(str(module.__file__), root / "protocol")
+    for module, text in sources.items():
+        source = source_of(root, module)
+        source.parent.mkdir(exist_ok=True)
+        (source.parent / "__init__.py").touch()
+        source.write_text(text)
+    for copied in _COPIED:
+        shutil.copy(str(copied.__file__), root / "protocol")
     return root
+
+
+def source_of(root: Path, module: str) -> Path:
+    """The file of a module in a tree."""
+    return root.joinpath(*module.split(".")).with_suffix(".py")
 
 
 def load_kernel_cache(tree: Path) -> Any:
