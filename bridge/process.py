@@ -16,19 +16,28 @@ _CONNECT_SLICE_S = 0.2
 
 
 class StopFlag:
-    """Set by SIGINT and SIGTERM; looked at where a loop may end with nothing half-written."""
+    """Set by SIGINT and SIGTERM; looked at where a loop may end with nothing half-written.
+
+    peer_restarts   times SIGURG came: the parent has started a process again that this one may be waiting for. The system
+                    ignores that signal in a process that has not got so far yet.
+    """
 
     def __init__(self) -> None:
         self.requested = False
+        self.peer_restarts = 0
 
     def install(self) -> None:
-        """Take over both signals in this process; a second one acts as it would by default."""
+        """Take over these signals in this process; a second one to stop acts as it would by default."""
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
+        signal.signal(signal.SIGURG, self._on_restart)
 
     def _on_signal(self, number: int, _frame: object) -> None:
         self.requested = True
         signal.signal(number, signal.SIG_DFL)
+
+    def _on_restart(self, _number: int, _frame: object) -> None:
+        self.peer_restarts += 1
 
     def check(self) -> None:
         """Raise Interrupted where a stop was requested."""

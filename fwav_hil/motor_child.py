@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+
 import click
 
 from fwav_hil.children import Child
@@ -25,18 +27,23 @@ class MotorKeeper:
         self.child = self._start()
 
     def look(self, children: list[Child], emulator: Child) -> None:
-        """Look after it: a new process joins `children`; one whose emulator has ended is asked to end."""
+        """Look after it: a new one joins `children`, and the emulator hears of it; one whose emulator has ended is ended."""
         code = self.child.process.poll()
         if emulator.process.poll() is not None:
-            if not self._asked:  # a second time would end it on the spot
-                self._asked = True
-                self.child.ask_to_end()
+            self.ask_to_end()
         elif code is not None and code < 0 and self.restarts < MOST_RESTARTS:
             self.restarts += 1
             click.echo(f"{self.child.failure}: started again ({self.restarts} of {MOST_RESTARTS})", err=True)
             self._ended.append(self.child)  # its pipes are still listened to
             self.child = self._start()
             children.append(self.child)
+            emulator.process.send_signal(signal.SIGURG)  # see `StopFlag`
+
+    def ask_to_end(self) -> None:
+        """Ask it to end, since the run does; once, since a second time would end it on the spot."""
+        if not self._asked and self.child.process.poll() is None:
+            self._asked = True
+            self.child.ask_to_end()
 
     def end(self) -> None:
         """Leave no process behind."""
@@ -44,15 +51,15 @@ class MotorKeeper:
             child.end()
 
     @property
-    def failed(self) -> bool:
-        """Whether it has ended, and will not be started again."""
+    def failure(self) -> str | None:
+        """Why it has ended before the run, not to be started again, in one sentence; None where it has not."""
         code = self.child.process.poll()
-        return (
-            code is not None
-            and code != 0
-            and (code > 0 or self.restarts == MOST_RESTARTS)
-            and self.child.failure is not None
-        )
+        if code is not None and code > 0:
+            return self.child.failure
+        if code is None or self._asked or (code < 0 and self.restarts < MOST_RESTARTS):
+            return None
+        how = f"was ended by signal {-code}, started again {MOST_RESTARTS} times before" if code else "ended"
+        return f"the process of the drives {how}, and the run with it: see what ends it, and fly again"
 
     def _start(self) -> Child:
         return Child("motor", self._job)

@@ -99,12 +99,12 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
     summary = summarise(folder, placement=placement.text, budget=known) if _has_rows(folder) else {}
     if stop.requested:
         raise Interrupted(f"interrupted: what was recorded until then is in {folder}")
-    culprits = _culprit_first(emulator, controller)
-    for child in (keeper.child, *culprits) if keeper and keeper.failed else culprits:
-        if child.failure:
-            raise RunFailedError(
-                child.failure, child.process.returncode if child.process.returncode > 0 else PeerError.exit_code
-            )
+    failures = [(child.failure, child.process.returncode) for child in _culprit_first(emulator, controller)]
+    if keeper:
+        failures.insert(0, (keeper.failure, keeper.child.process.returncode))
+    for failure, code in failures:
+        if failure:
+            raise RunFailedError(failure, code if code > 0 else PeerError.exit_code)
     return summary
 
 
@@ -148,7 +148,7 @@ def _watch(
             elif kind in ("motors_lost", "motors_back"):
                 said = "fell silent: safe output" if kind == "motors_lost" else "are back"
                 click.echo(f"t = {event['t_ns'] / NANOSECONDS:.3f} s: the drives {said}", err=True)
-            failed = any(one.process.poll() for one in (emulator, controller)) or bool(keeper and keeper.failed)
+            failed = any(one.process.poll() for one in (emulator, controller)) or bool(keeper and keeper.failure)
             if stop.requested or failed:
                 # What still runs ends by itself in a moment, or is asked to; signals of a terminal went to all already.
                 patience -= 1
@@ -156,7 +156,7 @@ def _watch(
                     emulator.ask_to_end()
                     controller.ask_to_end()
                     if keeper:
-                        keeper.child.ask_to_end()
+                        keeper.ask_to_end()
                 elif patience < -_PATIENCE:
                     return
 

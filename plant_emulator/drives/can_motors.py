@@ -1,12 +1,15 @@
 """The emulator's end of the motor bus: torques out as CAN frames, the force behind the gears back.
 
-Each command goes out as the protocol's frames, then a SYNC that gives the drives the time; six answers bring u. Waiting for
-them follows the `exact` rule: in lockstep the same bytes again after 10, 20, 40 ms ..., and nothing moves meanwhile. After
-2 s of wall time the drives are taken for gone: an outage, counted; the plant then gets the safe output, and goes on at the
-pace of wall time, looking for answers. Drives that come back are enabled again. 10 s without them disarm and end the run.
+Each command goes out as the protocol's frames, then a SYNC that gives the drives the time; six answers bring u.
 
-In real time an answer is waited for shortly, and the last u is held; after `actuators.staleness_s` without answers the
-outage begins.
+In lockstep simulation time stands still until all six have answered: the same bytes go out again after 10, 20, 40 ms ..., and
+after 8 s of wall time the run ends. Drives that were started again meanwhile are met again: they answer the very
+tick that was waited for, disabled and at the safe output, and are enabled with the next one. So the plant sees an outage of one
+tick, whatever the wait was, and the result depends on the tick alone at which the drives were lost.
+
+In real time an answer is waited for shortly, and the last u is held. After `actuators.staleness_s` without answers that is an
+outage, counted: the plant gets the safe output until the drives answer, and they are enabled again. 10 s without them
+disarm and end the run.
 
 feedback "bus" takes u from the protocol's own status frames, where they carry the position of the output shaft, as it was
 when they were sent: what an encoder behind the gear would give. In real time there is then no SYNC at all, as on hardware.
@@ -45,12 +48,13 @@ from protocol.scenario import NANOSECONDS, Scenario
 ENABLE_AGAIN_NS = NANOSECONDS // 10
 """Of simulation time, between two tries to enable drives that are not."""
 GIVE_UP_NS = 10 * NANOSECONDS
-"""Of wall time: an outage this long ends the run."""
+"""In real time: an outage this long ends the run."""
 HELLO_S = 0.1
 SHORT_WAIT_S = 0.002
 
-RESEND_AFTER_S = (0.010, 0.020, 0.040, 0.080, 0.160, 0.320, 0.640, 0.730)
-"""Waits of the exact rule, as in `pacing`: after each the frames are sent again; after the last, 2 s in all, an outage."""
+RESEND_AFTER_S = (0.010, 0.020, 0.040, 0.080, 0.160, 0.320, *(0.640,) * 11, 0.330)
+"""Waits in lockstep: after each the frames are sent again; after the last, 8 s in all, the run ends."""
+LONG_WAIT_S = 0.5
 
 Watch = Callable[[int, CanFrame], None]
 """Is told of each frame on the bus and the time (ns) it belongs to: a recorder, the tap."""
@@ -60,7 +64,8 @@ class CanMotors:
     """Six drives behind a bus, for the emulator.
 
     counters   motor_resent        commands sent again because not all drives had answered
-               motor_outages       times the drives were gone           motor_outage_ticks   ticks without them
+               motor_outages       times the drives were gone; in lockstep, times they were met again in the middle of a run
+               motor_outage_ticks  ticks without them: none in lockstep
                motor_recoveries    times all of them followed again     motor_safe_ticks     ticks with a drive not enabled
                motor_enables       times the drives were told to follow torques
                motor_late_answers  answers to an earlier tick, and copies
@@ -94,9 +99,12 @@ class CanMotors:
         self._stop = stop
         self._report = report
         self._waits_s = waits_s
+        self._digest = scenario.drive_digest()
         self._host = make_host(plan.protocol, scenario.motor)
         self.watches: list[Watch] = []
         self.poll: list[Callable[[], None]] = []
+        self.on_long_wait: list[Callable[[], None]] = []
+        """Called now and then while a tick's answer is long in coming, so that others who wait for us can be told."""
         self.tap_counters: dict[str, int] = {}
         self._now_ns = 0
         self.delay_ns = response_ns(plan) if scenario.motor.bus_delay else 0
@@ -106,6 +114,9 @@ class CanMotors:
         self._u: FloatArray = h * np.array(scenario.initial.command)
         self._bus_u = self._u.copy()
         self._heard = 0
+        self._answered = self._answered_enabled = 0
+        self._answers: FloatArray = np.zeros(DRIVES)
+        self._hello_ns: int | None = None
         self._all_enabled = False
         self._enabled = 0
         self._enable_ns: int | None = None
@@ -143,14 +154,15 @@ class CanMotors:
 
     def meet(self, wait_s: float) -> None:
         """Wait for the drives. Raises PeerMissingError, ScenarioMismatchError, LinkInUseError."""
-        digest = self._scenario.drive_digest()
         give_up_ns = self._clock.now_ns() + round(wait_s * NANOSECONDS)
         due = Due(1.0 / HELLO_S)
         seen = 0
         while (now_ns := self._clock.now_ns()) < give_up_ns:
             self._stop.check()
             if due.at(now_ns):
-                hello = [simulation_sync.encode_hello(digest, drives=False)] if self._syncs else self._host.disable()
+                hello = (
+                    [simulation_sync.encode_hello(self._digest, drives=False)] if self._syncs else self._host.disable()
+                )
                 for frame in hello:
                     self._bus.send(frame)
             received = self._bus.recv(HELLO_S)
@@ -160,13 +172,7 @@ class CanMotors:
                 raise LinkInUseError(
                     f"another emulator commands the drives on {self._bus.uri.text}: choose another bus with --can"
                 )
-            theirs = simulation_sync.decode_hello(received, drives=True)
-            if theirs is not None and theirs != digest:
-                raise ScenarioMismatchError(
-                    f"the drives hold another scenario (digest {theirs.hex()}, here {digest.hex()}): start both with the "
-                    "same scenario file, --protocol and --lag"
-                )
-            if self._syncs and theirs is not None:
+            if self._is_hello(received) and self._syncs:
                 return
             taken = self._host.take(received)
             if not self._syncs and not isinstance(taken, Cause):
@@ -175,32 +181,60 @@ class CanMotors:
                     return
         raise PeerMissingError(
             f"no drives on the CAN bus {self._bus.uri.text} answered within {wait_s:g} s, so the run was not armed: start "
-            f"them with `fwav-hil motor SCENARIO --can {self._bus.uri.text} --protocol {self._plan.protocol}`"
+            f"them with {self._command}"
         )
 
     def drive(self, t_ns: int, tau: FloatArray, acts_ns: int) -> FloatArray:
         """Command tau (6,) at time t_ns; returns the force behind the gears u (6,), which acts from acts_ns on.
 
-        Raises PeerLostError where the drives are gone for good, CanBusLostError where the bus is, Interrupted.
+        Raises PeerLostError where the drives are gone for good, ScenarioMismatchError where others took their place,
+        CanBusLostError where the bus is gone, Interrupted.
         """
         self._coming.append((acts_ns, tau.copy()))
         self._now_ns = t_ns
-        frames = self._frames(t_ns, tau)
-        for attempt, wait_s in enumerate(self._waits()):
-            if attempt:
+        self._answered = self._answered_enabled = 0
+        if self._ask(t_ns, self._frames(t_ns, tau)):
+            self._arrived(t_ns)
+        elif self._lockstep:
+            raise PeerLostError(
+                f"the drives on {self._bus.uri.text} gave no answer to the tick at t = {t_ns * 1e-9:.3f} s for "
+                f"{sum(self._waits_s):.0f} s: see whether they still run, or start them again with {self._command}"
+            )
+        else:
+            self._missed(t_ns)
+        return self._u.copy()
+
+    def _ask(self, t_ns: int, frames: list[CanFrame]) -> bool:
+        """Send the frames of a tick, in lockstep again and again; whether all six have answered."""
+        waits = deque(self._waits())
+        restarts = self._stop.peer_restarts
+        first = True
+        while waits:
+            if not first:
                 self._counters["motor_resent"] += 1
                 self._stop.check()
             for frame in frames:
                 self._bus.send(frame)
-                if not attempt:
+                if first:
                     self._note(t_ns, frame)
             for poll in self.poll:
                 poll()
+            wait_s = waits.popleft()
+            if wait_s >= LONG_WAIT_S:
+                for tell in self.on_long_wait:
+                    tell()
             if self._collect(t_ns, wait_s):
-                self._arrived(t_ns)
-                return self._u.copy()
-        self._missed(t_ns)
-        return self._u.copy()
+                return True
+            first = False
+            if self._stop.peer_restarts != restarts:  # a process that is just starting gets the whole time
+                restarts = self._stop.peer_restarts
+                waits = deque(self._waits())
+        return False
+
+    @property
+    def _command(self) -> str:
+        """What starts the drives."""
+        return f"`fwav-hil motor SCENARIO --can {self._bus.uri.text} --protocol {self._plan.protocol}`"
 
     def tau_at(self, t_ns: int) -> FloatArray:
         """The torques asked for that are in action at t_ns (6,); times must not decrease."""
@@ -224,21 +258,16 @@ class CanMotors:
             frames += self._host.enable([axis for axis in range(DRIVES) if not self._enabled >> axis & 1])
         frames += self._host.command(tau / self._scale)
         if self._syncs:
-            frames.append(simulation_sync.encode_sync(t_ns))
+            frames.append(simulation_sync.encode_sync(t_ns, lockstep=self._lockstep))
         return frames
 
     def _waits(self) -> tuple[float, ...]:
-        if not self._lockstep:
-            return (min(SHORT_WAIT_S, 0.25e-9 * self._scenario.period_ns),)
-        return (self._scenario.period_ns * 1e-9,) if self._out_ns is not None else self._waits_s
+        return self._waits_s if self._lockstep else (min(SHORT_WAIT_S, 0.25e-9 * self._scenario.period_ns),)
 
     def _collect(self, t_ns: int, wait_s: float) -> bool:
         """Take frames until all six have answered the SYNC of t_ns, or none came any more; whether they have."""
-        answered = 0
-        enabled = 0
         tick = t_ns // self._scenario.period_ns % TICKS
         deadline_ns = self._clock.now_ns() + round(wait_s * NANOSECONDS)
-        u = np.zeros(DRIVES)
         while True:
             remaining_ns = deadline_ns - self._clock.now_ns()
             frame = self._bus.recv(max(0.0, remaining_ns * 1e-9) if self._syncs else 0.0)
@@ -250,27 +279,30 @@ class CanMotors:
             if answer is None:
                 if self._begun or not self._syncs:  # what drives said in their own time is not of this run
                     self._note(t_ns, frame)
-                self._take(frame)
+                self._take(t_ns, frame)
             elif answer.tick != tick:
                 self._counters["motor_late_answers"] += 1
             else:
-                if answered >> answer.axis & 1:
+                if self._answered >> answer.axis & 1:
                     self._counters["motor_late_answers"] += 1
                     continue
                 self._begun = True
                 self._note(t_ns, frame)
-                u[answer.axis] = answer.u
-                answered |= 1 << answer.axis
-                enabled |= answer.enabled << answer.axis
-                if answered == ALL_AXES:
-                    self._u = self._bus_u.copy() if self._from_bus else u
-                    self._enabled = enabled
+                self._answers[answer.axis] = answer.u
+                self._answered |= 1 << answer.axis
+                self._answered_enabled |= answer.enabled << answer.axis
+                if self._answered == ALL_AXES:
+                    self._u = (self._bus_u if self._from_bus else self._answers).copy()
+                    self._enabled = self._answered_enabled
                     return True
             if remaining_ns < -NANOSECONDS:
                 return False
 
-    def _take(self, frame: CanFrame) -> None:
+    def _take(self, t_ns: int, frame: CanFrame) -> None:
         """Learn from a frame that is no answer."""
+        if self._begun and self._is_hello(frame):  # drives that join: what others had answered is void
+            self._hello_ns = t_ns
+            self._answered = self._answered_enabled = 0
         if simulation_sync.is_simulation_only(frame):
             return
         taken = self._host.take(frame)
@@ -279,6 +311,16 @@ class CanMotors:
             return
         for status in taken:
             self._learn(status)
+
+    def _is_hello(self, frame: CanFrame) -> bool:
+        """Whether drives say HELLO. Raises ScenarioMismatchError where it is of another scenario."""
+        theirs = simulation_sync.decode_hello(frame, drives=True)
+        if theirs is not None and theirs != self._digest:
+            raise ScenarioMismatchError(
+                f"the drives hold another scenario (digest {theirs.hex()}, here {self._digest.hex()}): start both with the "
+                "same scenario file, --protocol and --lag"
+            )
+        return theirs is not None
 
     def _learn(self, status: Status) -> None:
         bit = 1 << status.axis
@@ -307,7 +349,9 @@ class CanMotors:
         """All six have answered."""
         self._answered_ns = t_ns
         self._all_enabled = self._enabled == ALL_AXES
-        if self._out_ns is not None:
+        joined = self._lockstep and self._hello_ns == t_ns and not self._enabled
+        self._counters["motor_outages"] += joined
+        if joined or self._out_ns is not None:
             self._out_ns = None
             self._recovering = True
             self._enable_ns = None
@@ -319,11 +363,11 @@ class CanMotors:
             self._counters["motor_recoveries"] += 1
 
     def _missed(self, t_ns: int) -> None:
-        """The drives have not answered in time."""
+        """In real time: the drives have not answered in time."""
         now_ns = self._clock.now_ns()
         if self._out_ns is None:
             limit_ns = round(self._scenario.actuators.staleness_s * NANOSECONDS)
-            if not self._lockstep and t_ns - self._answered_ns <= (2 * NANOSECONDS if not self._syncs else limit_ns):
+            if t_ns - self._answered_ns <= (limit_ns if self._syncs else 2 * NANOSECONDS):
                 return  # the last u is held
             self._out_ns = now_ns
             self._all_enabled = False

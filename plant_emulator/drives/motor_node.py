@@ -1,14 +1,19 @@
 """The drives as a bus sees them: frames in, frames out, limits and watchdog kept, six nodes in one object. No I/O here.
 
-Time. From the first SYNC on (`motor_lockstep`) a node lives by the bridge's simulation time: it moves when a SYNC comes,
-answers it, and its watchdog counts SYNC time. Without SYNC, as with any other controller, it lives by its own clock. A host
-whose SYNC stays away for 2 s of wall time is taken for gone: time is the node's own again, and the watchdog acts.
+Time. From the first SYNC on (`simulation_sync`) a node lives by the bridge's simulation time: it moves when a SYNC comes,
+answers it, and its watchdog counts SYNC time. Without SYNC, as with any other controller, it lives by its own clock.
+
+A host whose SYNC stays away is taken for gone: time is the node's own again, and the watchdog acts. In real time that is so
+after 2 s. In lockstep a silent host may be waiting, or stand still on a busy machine: wall time changes nothing. Only after
+30 s, longer than a host waits for anybody, is its run over: should it come back it is not answered, so that a run ends with an
+error rather than with drives that let go in the middle of it.
 
 A drive gives its safe value (`actuators.safe`) until it is enabled, and again once a fault is latched: no command for
 `watchdog_s`, too hot, or stopped by an Estop. Torque jumps there and every filter is reset.
 
 The first SYNC of a run (t = 0) begins the flight where the direct path would: `initial.command` in action. A node that is
-started in the middle of one begins at its safe value: where the gears stood is lost with the process.
+started in the middle of one begins disabled, at its safe value (where the gears stood is lost with the process), and says
+HELLO before its first answers.
 """
 
 from __future__ import annotations
@@ -26,6 +31,8 @@ from protocol.motors.motor_protocol import CAUSES, DRIVES, Action, Cause, Drive,
 from protocol.scenario import NANOSECONDS, Scenario
 
 HOST_GONE_NS = 2 * NANOSECONDS
+RUN_OVER_NS = 30 * NANOSECONDS
+"""In lockstep: of wall time without a SYNC."""
 OWN_STEP_NS = NANOSECONDS // 1000
 """In its own time a node moves on at least this often, if it is given the chance."""
 LONGEST_STEP_NS = NANOSECONDS // 10
@@ -41,7 +48,8 @@ class MotorNode:
                                   came before all the commands they name (not answered)
                watchdog_trips, over_temperatures, estops
                                   faults latched, drive by drive
-               lost_hosts         times the SYNC stayed away for 2 s
+               lost_hosts         times the SYNC stayed away for too long
+               refused_syncs      SYNC frames of a host in lockstep whose run is over
                and one for each cause of `motor_protocol.Cause`
     """
 
@@ -69,7 +77,9 @@ class MotorNode:
         self._answers: list[CanFrame] = []
         self._heard_ns = 0
         self._fresh = True
-        names = ("taken", "syncs", "repeated_syncs", "backward_syncs", "waiting_syncs")
+        self._host_waits = False
+        self._run_is_over = False
+        names = ("taken", "syncs", "repeated_syncs", "backward_syncs", "waiting_syncs", "refused_syncs")
         faults = ("watchdog_trips", "over_temperatures", "estops", "lost_hosts")
         self.counters = dict.fromkeys((*names, *faults, *CAUSES), 0)
 
@@ -81,9 +91,10 @@ class MotorNode:
     def elapse(self, now_ns: int) -> list[CanFrame]:
         """Let wall time pass: now_ns from any start. Returns the cyclic messages due, where time is the node's own."""
         if self.in_lockstep:
-            if now_ns - self._heard_ns < HOST_GONE_NS:
+            if now_ns - self._heard_ns < (RUN_OVER_NS if self._host_waits else HOST_GONE_NS):
                 return []
             self.counters["lost_hosts"] += 1
+            self._run_is_over = self._host_waits
             self._use_own_time(now_ns)
         passed_ns = now_ns - self._heard_ns
         if passed_ns < OWN_STEP_NS:
@@ -136,8 +147,12 @@ class MotorNode:
         if sync is None:
             self.counters[Cause.FOREIGN.value] += 1
             return []
-        self._heard_ns = now_ns
         begins = sync.t_ns == 0 and self._fresh
+        if self._run_is_over and sync.lockstep and not begins:
+            self.counters["refused_syncs"] += 1
+            return []
+        self._heard_ns = now_ns
+        self._host_waits = sync.lockstep
         if not begins and sync.t_ns == self._sync_ns:
             self.counters["repeated_syncs"] += 1
             self._commanded = 0
@@ -154,6 +169,7 @@ class MotorNode:
     def _sync(self, t_ns: int, *, begins: bool) -> list[CanFrame]:
         """Move to the time of a new SYNC and on over the period it begins; answer it."""
         period_ns = self.scenario.period_ns
+        joins = self._sync_ns is None and not begins
         if begins:
             self.bank.begin(self._initial)
             self._positions = self._angles(self.bank.state.u)
@@ -165,7 +181,7 @@ class MotorNode:
             if self._commanded >> axis & 1 or self._sync_ns is None:
                 self._commanded_ns[axis] = t_ns
         self._commanded = 0
-        self._fresh = False
+        self._fresh = self._run_is_over = False
         self._sync_ns = t_ns
         self._move(t_ns, period_ns)
         tick = t_ns // self.scenario.period_ns
@@ -173,6 +189,8 @@ class MotorNode:
             simulation_sync.encode_answer(axis, tick, u, enabled=self._enabled[axis])
             for axis, u in enumerate(self.bank.state.mean_u.tolist())
         ]
+        if joins:
+            self._answers.insert(0, simulation_sync.encode_hello(self._digest, drives=True))
         return self._answers + self._cyclic()
 
     def _use_own_time(self, now_ns: int) -> None:

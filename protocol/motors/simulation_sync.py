@@ -4,8 +4,9 @@ Layout in simulation_sync.dbc, whose node SIMULATION_ONLY says so. All are class
 that any interface carries them, and DroneCAN, which speaks 29 bits only, never sees one. ODrive nodes from 44 on and MIT
 drives from 0x580 on would share them, and are refused by the scenario (`motor.first_node_id`).
 
-    SYNC      0x580                      t_ns (7 bytes), which axes were commanded since the last one (1 byte)
-    HELLO     0x581 host, 0x582 drives   the scenario's digest (8 bytes); the drives answer the host's
+    SYNC      0x580                      t_ns (56 bits), which axes were commanded since the last one (6), lockstep (bit 63)
+    HELLO     0x581 host, 0x582 drives   the scenario's digest (8 bytes); the drives answer the host's, and say it before
+                                         the first answers where they join a run that is under way
     ENCODERS  0x590 + axis               shaft angles before and after the gear (rad, float32 each), quantised
     ANSWER    0x600 + 64 axis + 32 enabled + tick mod 32      u (float64): the force of the gear's output, every bit of it
 
@@ -40,10 +41,14 @@ _DIGEST_BYTES = 8
 
 
 class Sync(NamedTuple):
-    """t_ns: simulation time. commanded: bit i set where axis i was commanded since the last SYNC."""
+    """t_ns: simulation time. commanded: bit i set where axis i was commanded since the last SYNC.
+
+    lockstep: simulation time stands still until all have answered, however long that takes.
+    """
 
     t_ns: int
     commanded: int
+    lockstep: bool
 
 
 class SyncAnswer(NamedTuple):
@@ -63,16 +68,16 @@ def is_simulation_only(frame: CanFrame) -> bool:
     return SYNC <= can_id <= HELLO_DRIVES or ENCODERS <= can_id < ENCODERS + DRIVES or _is_answer(can_id)
 
 
-def encode_sync(t_ns: int, commanded: int = ALL_AXES) -> CanFrame:
+def encode_sync(t_ns: int, commanded: int = ALL_AXES, *, lockstep: bool = True) -> CanFrame:
     """The frame that gives the drives the time."""
-    return CanFrame(SYNC, (t_ns | commanded << 56).to_bytes(8, "little"))
+    return CanFrame(SYNC, (t_ns | commanded << 56 | lockstep << 63).to_bytes(8, "little"))
 
 
 def decode_sync(frame: CanFrame) -> Sync | None:
     """The time of a SYNC; None for any other frame."""
     if frame.can_id != SYNC or frame.extended or len(frame.data) != 8:
         return None
-    return Sync(int.from_bytes(frame.data[:7], "little"), frame.data[7])
+    return Sync(int.from_bytes(frame.data[:7], "little"), frame.data[7] & ALL_AXES, bool(frame.data[7] >> 7))
 
 
 def encode_answer(axis: int, tick: int, u: float, *, enabled: bool) -> CanFrame:

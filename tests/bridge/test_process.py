@@ -41,8 +41,8 @@ def python(code: str) -> subprocess.Popen[str]:
 
 @pytest.fixture
 def stop() -> Iterator[StopFlag]:
-    """A flag that has taken both signals over; the handlers from before come back afterwards."""
-    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+    """A flag that has taken its signals over; the handlers from before come back afterwards."""
+    before = {number: signal.getsignal(number) for number in (*STOP_SIGNALS, signal.SIGURG)}
     flag = StopFlag()
     flag.install()
     yield flag
@@ -86,6 +86,19 @@ print("alive")
         with python(code) as process:
             assert process.communicate(timeout=PATIENCE_S)[0] == "True\n"
         assert process.returncode == -number
+
+    def test_a_peer_that_was_started_again_is_counted_and_stops_nothing(self, stop: StopFlag) -> None:
+        for count in (1, 2):
+            signal.raise_signal(signal.SIGURG)
+            assert stop.peer_restarts == count
+            stop.check()
+
+    def test_that_signal_does_no_harm_before_anyone_listens(self) -> None:
+        before = signal.signal(signal.SIGURG, signal.SIG_DFL)
+        try:
+            signal.raise_signal(signal.SIGURG)
+        finally:
+            signal.signal(signal.SIGURG, before)
 
 
 class TestEndWithParent:

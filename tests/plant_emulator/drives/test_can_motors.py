@@ -22,7 +22,7 @@ from bridge.timing.clock import MonotonicClock
 from fwav_hil.bus_plot import plot_bus, read_encoders
 from fwav_hil.score import scores
 from fwav_hil.simulate import simulate
-from plant_emulator.drives.can_motors import CanMotors
+from plant_emulator.drives.can_motors import RESEND_AFTER_S, CanMotors
 from plant_emulator.drives.motor_node import MotorNode
 from plant_emulator.drives.motor_process import MotorThread
 from plant_emulator.options import MotorLink
@@ -31,7 +31,7 @@ from protocol.can_frame import CanFrame
 from protocol.errors import LinkInUseError, PeerLostError, PeerMissingError, ScenarioMismatchError, UsageError
 from protocol.messages import AXES
 from protocol.motors.motor_protocol import PROTOCOLS, make_host
-from protocol.motors.simulation_sync import decode_answer, decode_sync, encode_sync
+from protocol.motors.simulation_sync import decode_answer, decode_sync, encode_answer, encode_hello, encode_sync
 from protocol.scenario import Scenario
 from tests.dbc import our_dbc
 from tests.loop import fly_both
@@ -170,13 +170,14 @@ def test_real_time_on_the_protocol_alone_needs_no_sync(tmp_path: Path, uri: str)
 class Rig:
     """The emulator's end of the bus and drives in a thread, without a flight; waits are short."""
 
-    def __init__(self, uri: str, scenario: Scenario | None = None) -> None:
+    def __init__(self, uri: str, scenario: Scenario | None = None, *, lockstep: bool = True) -> None:
         self.scenario = scenario or short()
         self.events: list[str] = []
+        self.stop = StopFlag()
         self.bus = CanBus(uri, 1_000_000)
         plan = plan_bus("odrive", self.scenario.motor, 250.0)
         self.motors = CanMotors(
-            self.scenario, self.bus, plan, lockstep=True, feedback="sync", clock=MonotonicClock(), stop=StopFlag(),
+            self.scenario, self.bus, plan, lockstep=lockstep, feedback="sync", clock=MonotonicClock(), stop=self.stop,
             report=lambda event: self.events.append(event["event"]), waits_s=(0.05, 0.05),
         )  # fmt: skip
         self.t_ns = -4_000_000
@@ -193,8 +194,8 @@ class Rig:
 def rig(uri: str) -> Iterator[Callable[..., Rig]]:
     made: list[Rig] = []
 
-    def make(scenario: Scenario | None = None) -> Rig:
-        made.append(Rig(uri, scenario))
+    def make(scenario: Scenario | None = None, *, lockstep: bool = True) -> Rig:
+        made.append(Rig(uri, scenario, lockstep=lockstep))
         return made[-1]
 
     yield make
@@ -202,43 +203,188 @@ def rig(uri: str) -> Iterator[Callable[..., Rig]]:
         one.bus.close()
 
 
-def test_drives_that_vanish_are_an_outage_with_safe_output_and_are_taken_up_again(
+def test_in_real_time_drives_that_vanish_are_an_outage_with_safe_output_and_are_taken_up_again(
     rig: Callable[..., Rig], uri: str
 ) -> None:
-    one = rig()
+    one = rig(lockstep=False)
     with MotorThread(one.scenario, "odrive", uri):
         one.motors.meet(10.0)
-        assert one.tick()[0] != 0.0
-    before = one.tick()
-    assert not before.any()  # the safe output
+        for _ in range(10_000):  # nobody waits for the thread, which may need a moment
+            held = one.tick()
+            if held[0] > 0.0:
+                break
+    one.events.clear()
+    before = one.counted().get("motor_outages", 0), one.counted().get("motor_outage_ticks", 0)
+    for _ in range(40):
+        last = one.tick()
+        if "motors_lost" in one.events:
+            break
+        assert np.array_equal(last, held), "for actuators.staleness_s"
+    assert not last.any()  # the safe output
     one.tick()
     assert one.events == ["motors_lost"]
-    assert one.counted()["motor_outages"] == 1
-    assert one.counted()["motor_outage_ticks"] == 2
-    assert one.counted()["motor_resent"] == 1  # in an outage nothing is sent twice
+    assert one.counted()["motor_outages"] == before[0] + 1
+    assert one.counted()["motor_outage_ticks"] == before[1] + 2
     with MotorThread(one.scenario, "odrive", uri):
-        for _ in range(200):  # the thread may need a moment
-            one.tick()
-            if "motors_back" in one.events:
-                break
-        for _ in range(30):
+        for _ in range(10_000):
             last = one.tick()
-    assert one.events == ["motors_lost", "motors_back"]
-    assert one.counted()["motor_recoveries"] == 1
-    assert last[0] != 0.0
+            if last[0] > 0.0:
+                break
+    assert one.events[:2] == ["motors_lost", "motors_back"]
+    assert last[0] > 0.0
+    assert one.counted()["motor_recoveries"] >= 1
 
 
-def test_drives_that_stay_away_disarm_and_end_the_run(
+def test_in_real_time_drives_that_stay_away_disarm_and_end_the_run(
     rig: Callable[..., Rig], uri: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("plant_emulator.drives.can_motors.GIVE_UP_NS", 20_000_000)
-    one = rig()
+    one = rig(lockstep=False)
     with MotorThread(one.scenario, "odrive", uri):
         one.motors.meet(10.0)
         one.tick()
     with pytest.raises(PeerLostError, match="the run is disarmed"):
         for _ in range(1000):
             one.tick()
+
+
+class TestLockstepWithDrivesAway:
+    """Simulation time stands still: how long the drives are away changes nothing but the number of repetitions."""
+
+    def flight(self, one: Rig, away_s: float) -> tuple[list[Any], dict[str, int]]:
+        """60 ticks, u and counters; after 20 the drives are gone for some wall time, and then others take their place."""
+        one.motors._waits_s = (0.02,) * 3000
+        uri = one.bus.uri.text
+        with MotorThread(one.scenario, "odrive", uri):
+            one.motors.meet(10.0)
+            seen = [one.tick(0.02 * np.sin(k)) for k in range(20)]
+        following = MotorThread(one.scenario, "odrive", uri)
+        timer = threading.Timer(away_s, following.__enter__)
+        timer.start()
+        try:
+            seen += [one.tick(0.02 * np.sin(k)) for k in range(20, 60)]
+        finally:
+            timer.join()
+            following.__exit__(None, None, None)
+        return seen, one.counted()
+
+    def test_the_result_depends_on_the_tick_alone_at_which_they_were_lost(self, rig: Callable[..., Rig]) -> None:
+        (seen, counted), (seen_later, counted_later) = [self.flight(rig(short(lag_s=0.002)), s) for s in (0.0, 0.3)]
+        assert np.array_equal(seen, seen_later)
+        assert counted_later["motor_resent"] > counted.get("motor_resent", 0)
+        of_the_wait = {"motor_resent", "motor_late_answers"}
+        counted, counted_later = (
+            {k: n for k, n in c.items() if k not in of_the_wait} for c in (counted, counted_later)
+        )
+        assert (
+            counted
+            == counted_later
+            == {"motor_outages": 1, "motor_recoveries": 1, "motor_safe_ticks": 1, "motor_enables": 2}
+        )
+
+    def test_the_plant_sees_one_tick_at_the_safe_output(self, rig: Callable[..., Rig]) -> None:
+        one = rig()
+        seen, _ = self.flight(one, 0.1)
+        assert one.events == ["motors_back"]
+        safe = np.array(one.scenario.hysteresis.h) * np.array(one.scenario.actuators.safe)
+        assert [k for k, u in enumerate(seen) if np.array_equal(u, safe)] == [20]
+
+    def test_none_that_come_end_the_run_with_their_name(self, rig: Callable[..., Rig], uri: str) -> None:
+        one = rig()
+        with MotorThread(one.scenario, "odrive", uri):
+            one.motors.meet(10.0)
+            one.tick()
+        with pytest.raises(
+            PeerLostError, match=r"the drives on virtual:.* gave no answer to the tick at t = 0\.004 s"
+        ) as lost:
+            one.tick()
+        assert "start them again with `fwav-hil motor SCENARIO --can virtual:" in str(lost.value)
+        assert lost.value.exit_code == 4
+        assert one.counted()["motor_resent"] == 1
+        assert "motor_outages" not in one.counted()
+
+    def test_they_are_waited_for_8_s(self) -> None:
+        assert sum(RESEND_AFTER_S) == pytest.approx(8.0)
+        assert RESEND_AFTER_S[:3] == (0.01, 0.02, 0.04)
+
+    def test_a_process_that_is_started_again_gets_the_whole_time(self, rig: Callable[..., Rig]) -> None:
+        one = rig()
+        restarts = iter([True, False, True])
+
+        def look() -> None:
+            one.stop.peer_restarts += next(restarts, False)
+
+        one.motors.poll.append(look)
+        with pytest.raises(PeerLostError):
+            one.tick()
+        # Sent with 2 waits ahead, 2 again, 1, 2 again, 1: five times.
+        assert one.counted()["motor_resent"] == 4
+
+    def test_a_long_wait_is_told_to_those_who_wait_for_us(
+        self, rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("plant_emulator.drives.can_motors.LONG_WAIT_S", 0.03)
+        one = rig()
+        one.motors._waits_s = (0.01, 0.02, 0.03, 0.04)
+        told: list[int] = []
+        one.motors.on_long_wait.append(lambda: told.append(one.counted().get("motor_resent", 0)))
+        with pytest.raises(PeerLostError):
+            one.tick()
+        assert told == [2, 3]
+
+    def test_others_with_another_scenario_are_refused(self, rig: Callable[..., Rig], uri: str) -> None:
+        one = rig()
+        with MotorThread(one.scenario, "odrive", uri):
+            one.motors.meet(10.0)
+            one.tick()
+        with (
+            MotorThread(short(lag_s=0.005), "odrive", uri),
+            pytest.raises(ScenarioMismatchError, match="hold another scenario"),
+        ):
+            for _ in range(2):
+                one.motors._waits_s = (0.02,) * 500
+                one.tick()
+
+    def test_what_the_lost_ones_had_answered_is_void(self, rig: Callable[..., Rig], uri: str) -> None:
+        """Three axes answered before the process was killed; the one that takes its place answers for all six."""
+        one = rig()
+        one.motors._waits_s = (0.05,) * 100
+        digest = one.scenario.drive_digest()
+        said = [
+            [encode_answer(axis, 0, 1.0, enabled=True) for axis in range(6)],
+            [encode_answer(axis, 1, 2.0, enabled=True) for axis in range(3)],
+            [encode_hello(digest, drives=True), *(encode_answer(axis, 1, 3.0, enabled=False) for axis in range(6))],
+        ]
+        ending = threading.Event()
+
+        def speak() -> None:
+            with CanBus(uri, 1_000_000) as bus:
+                while not ending.is_set():
+                    frame = bus.recv(0.05)
+                    if frame is not None and decode_sync(frame) and said:
+                        for answer in said.pop(0):
+                            bus.send(answer)
+
+        thread = threading.Thread(target=speak)
+        thread.start()
+        try:
+            assert one.tick().tolist() == [1.0] * 6
+            assert one.tick().tolist() == [3.0] * 6
+        finally:
+            ending.set()
+            thread.join(10.0)
+        assert one.counted()["motor_outages"] == 1
+
+    def test_a_hello_that_somebody_else_asked_for_changes_nothing(self, rig: Callable[..., Rig], uri: str) -> None:
+        one = rig()
+        one.motors._waits_s = (0.02,) * 500
+        with MotorThread(one.scenario, "odrive", uri), CanBus(uri, 1_000_000) as station:
+            one.motors.meet(10.0)
+            for _ in range(10):
+                one.tick()
+            station.send(encode_hello(bytes(8), drives=False))
+            assert all(one.tick()[0] != 0.0 for _ in range(10))
+        assert {"motor_outages", "motor_safe_ticks", "motor_recoveries"}.isdisjoint(one.counted())
 
 
 def test_drives_that_never_answer_leave_the_run_unarmed(rig: Callable[..., Rig]) -> None:
@@ -301,6 +447,10 @@ def test_lost_and_late_frames_change_no_answer(rig: Callable[..., Rig], uri: str
     thread = threading.Thread(target=lossy)
     thread.start()
     one.motors._waits_s = (0.02,) * 100
+    noted: list[tuple[int, int]] = []
+    one.motors.watches.append(
+        lambda t_ns, frame: noted.append((t_ns, answer.axis)) if (answer := decode_answer(frame)) else None
+    )
     try:
         one.motors.meet(10.0)
         seen = [one.tick(0.02 * np.sin(k)) for k in range(60)]
@@ -317,4 +467,5 @@ def test_lost_and_late_frames_change_no_answer(rig: Callable[..., Rig], uri: str
         expected.append(reference.bank.state.mean_u.copy())
     assert one.counted()["motor_resent"] > 5
     assert one.counted()["motor_late_answers"] > 5
+    assert sorted(noted) == [(k * 4_000_000, axis) for k in range(60) for axis in range(6)], "each once in the record"
     assert np.array_equal(seen, expected)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from plant_emulator.drives.motor_node import HOST_GONE_NS, MotorNode, is_of_drives
+from plant_emulator.drives.motor_node import HOST_GONE_NS, RUN_OVER_NS, MotorNode, is_of_drives
 from protocol.can_frame import CanFrame
 from protocol.motors.motor_protocol import PROTOCOLS, Fault, Host, make_host
 from protocol.motors.simulation_sync import (
@@ -18,6 +18,7 @@ from protocol.motors.simulation_sync import (
     decode_hello,
     encode_hello,
     encode_sync,
+    is_simulation_only,
 )
 from tests.plant_emulator.drives.test_motor import with_motor
 
@@ -29,6 +30,7 @@ class Bench:
     """A node and a host that talks to it, without a bus. `t_ns` is SYNC time, `now_ns` wall time."""
 
     def __init__(self, protocol: str, **motor: Any) -> None:
+        self.protocol = protocol
         self.scenario = with_motor(**({"lag_s": 0.0} | motor))
         self.node = MotorNode(self.scenario, protocol)
         self.host: Host = make_host(protocol, self.scenario.motor)
@@ -41,11 +43,11 @@ class Bench:
     def enable(self) -> None:
         self.say(self.host.enable())
 
-    def tick(self, torque: float | None = 0.25) -> list[CanFrame]:
-        """One tick of lockstep; None: the commands stay away, and the SYNC says so."""
+    def tick(self, torque: float | None = 0.25, *, lockstep: bool = True) -> list[CanFrame]:
+        """One tick; torque None: the commands stay away, and the SYNC says so."""
         self.t_ns += PERIOD_NS
         frames = [] if torque is None else self.host.command(np.full(6, torque))
-        return self.say([*frames, encode_sync(self.t_ns, 0 if torque is None else ALL_AXES)])
+        return self.say([*frames, encode_sync(self.t_ns, 0 if torque is None else ALL_AXES, lockstep=lockstep)])
 
     def wait(self, duration_ns: int) -> list[CanFrame]:
         """Let wall time pass."""
@@ -122,19 +124,54 @@ def test_a_killed_sender_trips_the_watchdog_in_the_drives_own_time(bench: Bench)
     assert bench.torques() == [0.0] * 6
 
 
-def test_a_host_killed_in_lockstep_is_gone_after_2_s_of_wall_time(bench: Bench) -> None:
+def test_a_host_killed_in_real_time_is_gone_after_2_s(bench: Bench) -> None:
     bench.enable()
-    bench.tick()
-    assert bench.wait(HOST_GONE_NS - 10 * MILLISECOND) == []  # time stands still: a stall changes nothing
+    bench.tick(lockstep=False)
+    assert bench.wait(HOST_GONE_NS - 10 * MILLISECOND) == []
     assert all(bench.enabled())
     bench.wait(20 * MILLISECOND)
     assert (bench.node.counters["lost_hosts"], bench.node.counters["watchdog_trips"]) == (1, 6)
     assert bench.torques() == [0.0] * 6
+    bench.enable()  # it was a stall: the drives are taken up again
+    answers = [answer for frame in bench.tick(lockstep=False) if (answer := decode_answer(frame))]
+    assert all(answer.enabled for answer in answers)
+
+
+def test_a_host_silent_in_lockstep_changes_nothing_until_its_run_is_over(bench: Bench) -> None:
+    """However busy the machine is; and once the drives have let go that run is not flown on as if nothing were."""
+    undisturbed = Bench(bench.protocol)
+    for one in (undisturbed, bench):
+        one.enable()
+        one.tick()
+    assert bench.wait(RUN_OVER_NS - 10 * MILLISECOND) == []
+    assert bench.tick() == undisturbed.tick()
+    assert bench.node.counters == undisturbed.node.counters
+    assert bench.wait(RUN_OVER_NS - 10 * MILLISECOND) == []
+    bench.wait(20 * MILLISECOND)
+    assert (bench.node.counters["lost_hosts"], bench.node.counters["watchdog_trips"]) == (1, 6)
+    assert bench.torques() == [0.0] * 6
+    assert not any(decode_answer(frame) for frame in bench.tick())
+    assert bench.node.counters["refused_syncs"] == 1
     bench.enable()  # another run begins
     bench.say([encode_hello(bench.scenario.drive_digest(), drives=False)])
     bench.t_ns = -PERIOD_NS
-    answers = [answer for frame in bench.tick() if (answer := decode_answer(frame))]
-    assert all(answer.enabled for answer in answers)
+    for _ in range(2):
+        answers = [answer for frame in bench.tick() if (answer := decode_answer(frame))]
+        assert len(answers) == 6
+        assert all(answer.enabled for answer in answers)
+
+
+def test_drives_that_join_a_run_say_hello_and_begin_disabled_at_the_safe_output(bench: Bench) -> None:
+    bench.t_ns = 99 * PERIOD_NS
+    first = [frame for frame in bench.tick() if is_simulation_only(frame)]
+    assert decode_hello(first[0], drives=True) == bench.scenario.drive_digest()
+    answers = [answer for frame in first if (answer := decode_answer(frame))]
+    assert [(answer.axis, answer.enabled) for answer in answers] == [(axis, False) for axis in range(6)]
+    assert not bench.node.bank.state.u.any()
+    again = bench.say([encode_sync(bench.t_ns)])
+    assert again == first[:7], "as long as the host may not have heard it"
+    assert not any(decode_hello(frame, drives=True) for frame in bench.tick())
+    assert not any(decode_hello(frame, drives=True) for frame in Bench(bench.protocol).tick()), "a run that begins"
 
 
 def test_a_status_says_what_happened(bench: Bench) -> None:

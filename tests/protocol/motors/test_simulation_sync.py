@@ -36,11 +36,12 @@ def test_an_answer_keeps_every_bit(axis: int, tick: int, u: float, enabled: bool
     assert message.encode({"u": u}) == frame.data
 
 
-@given(st.integers(0, 4_000_000 * 10**9), st.integers(0, 63))
-def test_a_sync_is_laid_out_as_the_dbc_says(t_ns: int, commanded: int) -> None:
-    frame = encode_sync(t_ns, commanded)
-    assert decode_sync(frame) == (t_ns, commanded)
-    assert frame.data == DATABASE.encode_message("Sync", {"t_ns": t_ns, "commanded": commanded})
+@given(st.integers(0, 4_000_000 * 10**9), st.integers(0, 63), st.booleans())
+def test_a_sync_is_laid_out_as_the_dbc_says(t_ns: int, commanded: int, lockstep: bool) -> None:
+    frame = encode_sync(t_ns, commanded, lockstep=lockstep)
+    assert decode_sync(frame) == (t_ns, commanded, lockstep)
+    values = {"t_ns": t_ns, "commanded": commanded, "lockstep": lockstep}
+    assert frame.data == DATABASE.encode_message("Sync", values)
 
 
 @given(st.binary(min_size=8, max_size=8))
