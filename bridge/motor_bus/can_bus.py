@@ -112,6 +112,11 @@ class CanBus:
                 f"cannot open the CAN bus {uri}: {_reason(error)}; see that it exists, or choose another"
             ) from None
 
+    @property
+    def trouble(self) -> str:
+        """Why the interface is away just now; empty where it is not."""
+        return "" if self._lost_ns is None else self._why
+
     def _open(self) -> Any:
         uri = self.uri
         arguments: dict[str, Any] = {"interface": uri.interface, "channel": uri.channel}

@@ -196,9 +196,10 @@ class CanMotors:
         if self._ask(t_ns, self._frames(t_ns, tau)):
             self._arrived(t_ns)
         elif self._lockstep:
+            trouble = f" (the interface is away: {self._bus.trouble})" if self._bus.trouble else ""
             raise PeerLostError(
                 f"the drives on {self._bus.uri.text} gave no answer to the tick at t = {t_ns * 1e-9:.3f} s for "
-                f"{sum(self._waits_s):.0f} s: see whether they still run, or start them again with {self._command}"
+                f"{sum(self._waits_s):.0f} s{trouble}: see whether they still run, or start them again with {self._command}"
             )
         else:
             self._missed(t_ns)

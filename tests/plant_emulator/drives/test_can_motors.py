@@ -303,6 +303,22 @@ class TestLockstepWithDrivesAway:
         assert one.counted()["motor_resent"] == 1
         assert "motor_outages" not in one.counted()
 
+    def test_a_bus_that_is_away_is_named_too(
+        self, rig: Callable[..., Rig], uri: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        one = rig()
+        with MotorThread(one.scenario, "odrive", uri):
+            one.motors.meet(10.0)
+            one.tick()
+
+        def gone(*_: object) -> None:
+            raise can.CanError("no such device")
+
+        monkeypatch.setattr(one.bus._bus, "send", gone)
+        monkeypatch.setattr(one.bus, "_open", gone)
+        with pytest.raises(PeerLostError, match=r"\(the interface is away: no such device\)"):
+            one.tick()
+
     def test_they_are_waited_for_8_s(self) -> None:
         assert sum(RESEND_AFTER_S) == pytest.approx(8.0)
         assert RESEND_AFTER_S[:3] == (0.01, 0.02, 0.04)
