@@ -31,7 +31,7 @@ class Lockstep(Pacing):
         self._strays = 0
         self.counters = {"resent": 0, "foreign": 0}
         if self.emulator.motors:  # a tick sent again keeps the controller waiting while we wait for the drives
-            self.emulator.motors.on_long_wait.append(lambda: self.endpoint.link.send(self._datagram))
+            self.emulator.motors.on_long_wait.append(lambda: self.endpoint.link.send(self.datagram))
 
     def begin(self, t_ns: int) -> None:
         """Wait for the tick's time, where there is a speed to keep."""
