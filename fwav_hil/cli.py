@@ -24,10 +24,10 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
         "run": ("fwav_hil.cli:run_command", "Fly a scenario: emulator and controller as two processes on a link."),
         "simulate": ("fwav_hil.cli:simulate_command", "Fly a scenario in this process, without a link."),
-        "emulator": ("plant_emulator.command:emulator", "Run the plant emulator alone."),
-        "controller": ("controller.command:controller", "Run the controller alone."),
+        "emulator": ("fwav_hil.commands.emulator:emulator", "Run the plant emulator alone."),
+        "controller": ("fwav_hil.commands.controller:controller", "Run the controller alone."),
         "latency": ("fwav_hil.latency.command:latency", "Measure where the time goes in the loop or on a link."),
-        "motor": ("plant_emulator.drives.motor_command:motor", "Be six simulated drives on a CAN bus."),
+        "motor": ("fwav_hil.commands.motor:motor", "Be six simulated drives on a CAN bus."),
         "paper": ("fwav_hil.studies.paper_command:paper_command", "Run the source paper's section IV again."),
         "margin": ("fwav_hil.studies.margin_command:margin_command", "Say whether the gains stand the link."),
         "design": ("fwav_hil.studies.design_command:design_command", "Search gains for a link."),

@@ -65,7 +65,7 @@ def check_motors(scenario: Scenario, motors: MotorLink) -> None:
     if motors.tap:
         parse_link_uri(motors.tap)
     if motors.log:
-        from plant_emulator.drives.can_recorder import check_record
+        from bridge.motor_bus.can_recorder import check_record
 
         check_record(motors.log)
 

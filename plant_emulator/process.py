@@ -39,7 +39,7 @@ from protocol.scenario import NANOSECONDS, Scenario
 from protocol.wire import mapping
 
 if TYPE_CHECKING:
-    from plant_emulator.drives.can_motors import CanMotors
+    from bridge.motor_bus.drives import CanMotors
 
 STATION_FILE = "station_emulator.tlog"
 HELLO_PERIOD_S = 0.1

@@ -32,7 +32,7 @@ from protocol.wire.tick_frames import write_tick
 from protocol.wire.truth_mapping import ODOMETRY, RPM, STATE, encode_odometry, encode_rpm, encode_state
 
 if TYPE_CHECKING:  # what a run without a CAN bus need not load
-    from plant_emulator.drives.can_motors import CanMotors
+    from bridge.motor_bus.drives import CanMotors
 
 TRUTH = (STATE, ODOMETRY)
 

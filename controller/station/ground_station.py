@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from bridge.parameter_server import ParameterServer
 from bridge.requests import Requests
 from bridge.station import POLL_HZ, Station
 from controller.parameters import Parameters
 from controller.session import OFFERED, HilSession
-from controller.station.parameter_server import ParameterServer
 from protocol.due import Due
 from protocol.wire.file_transfer import FILE_TRANSFER, encode_refusal
 from protocol.wire.mapping import VERSION

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 from bridge.motor_bus.can_bus import CanBus
 from bridge.motor_bus.can_load import plan_bus
+from bridge.motor_bus.can_recorder import CanRecorder
 from bridge.motor_bus.can_tap import CanTap
+from bridge.motor_bus.drives import CanMotors
 from bridge.process import StopFlag, open_patiently
 from bridge.reporting import Report
 from bridge.timing.clock import MonotonicClock
-from plant_emulator.drives.can_motors import CanMotors
-from plant_emulator.drives.can_recorder import CanRecorder
 from plant_emulator.drives.motor_process import MotorThread
 from protocol.can_frame import CanFrame
 from protocol.motors.can_stuffing import exact_bits

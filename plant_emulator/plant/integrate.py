@@ -227,25 +227,6 @@ def fill_row(state: PlantState, command: FloatArray, row: FloatArray) -> None:
 
 
 @compiled
-def _push_packed(state: Packed, t_ns: int, tau: FloatArray) -> bool:
-    """`push_command` on a packed state."""
-    return push_command(state[0], t_ns, tau)
-
-
-@compiled
-def _apply_packed(state: Packed, parameters: Packed, t_ns: int) -> None:
-    """`apply_due_commands` on packed structures."""
-    apply_due_commands(state[0], parameters[0], t_ns)
-
-
-@compiled
-def _advance_packed(state: Packed, parameters: Packed, t_ns: int, end_ns: int) -> int:
-    """`advance` on packed structures."""
-    data = parameters[0]
-    return advance(state[0], data, data, t_ns, end_ns, data.substep_ns)
-
-
-@compiled
 def record_and_advance(
     state: PlantState, parameters: Any, t_ns: int, end_ns: int, command: FloatArray, row: FloatArray
 ) -> int:
@@ -260,11 +241,6 @@ def _record_and_advance_packed(
     state: Packed, parameters: Packed, t_ns: int, end_ns: int, command: FloatArray, row: FloatArray
 ) -> int:
     return record_and_advance(state[0], parameters[0], t_ns, end_ns, command, row)
-
-
-@compiled
-def _specific_force_packed(state: Packed, parameters: Packed, t: float, force: FloatArray) -> None:
-    specific_force(t, state[0].wrench, parameters[0], force)
 
 
 class Plant:
@@ -288,7 +264,7 @@ class Plant:
 
     def command(self, t_ns: int, tau: FloatArray) -> None:
         """Let tau (6,) act from t_ns on; times must not decrease. Raises DivergenceError where too many are on their way."""
-        if not _push_packed(self.state.packed, t_ns, tau):
+        if not push_command(self.state.packed[0], t_ns, tau):
             self.refuse_more()
 
     def refuse_more(self) -> None:
@@ -297,11 +273,12 @@ class Plant:
 
     def apply_due_commands(self) -> None:
         """Let the commands act whose time is now, without moving on."""
-        _apply_packed(self.state.packed, self.parameters, self.t_ns)
+        apply_due_commands(self.state.packed[0], self.parameters[0], self.t_ns)
 
     def advance(self, end_ns: int) -> None:
         """Integrate up to end_ns. Raises DivergenceError; the state is then the last one computed."""
-        self.arrive(end_ns, _advance_packed(self.state.packed, self.parameters, self.t_ns, end_ns))
+        parameters = self.parameters[0]
+        self.arrive(end_ns, advance(self.state.packed[0], parameters, parameters, self.t_ns, end_ns, self.substep_ns))
 
     def record_and_advance(self, end_ns: int, command: FloatArray, row: FloatArray) -> None:
         """Let the commands act whose time is now, fill the row (31,) of this moment (see `fill_row`), then `advance`."""
@@ -311,7 +288,7 @@ class Plant:
     def specific_force(self) -> FloatArray:
         """What an accelerometer reads now (3,), m/s^2: a - g in the body frame."""
         force = np.empty(3)
-        _specific_force_packed(self.state.packed, self.parameters, self.t_ns * 1e-9, force)
+        specific_force(self.t_ns * 1e-9, self.state.wrench, self.parameters[0], force)
         return force
 
     def arrive(self, end_ns: int, outcome: int) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from protocol.compiled import Packed, compiled, pack
+from protocol.compiled import compiled, pack
 from protocol.messages import FloatArray
 from protocol.scenario import NANOSECONDS, Actuators
 
@@ -54,16 +54,6 @@ def expired_ns(envelope: Any, t_ns: int) -> int:
     return int(since_ns)
 
 
-@compiled
-def _pass_packed(envelope: Packed, t_ns: int, tau: FloatArray, armed: bool) -> None:
-    pass_command(envelope[0], t_ns, tau, armed)
-
-
-@compiled
-def _expired_packed(envelope: Packed, t_ns: int) -> int:
-    return expired_ns(envelope[0], t_ns)
-
-
 class SafetyEnvelope:
     """Limits, arming and staleness.
 
@@ -94,10 +84,10 @@ class SafetyEnvelope:
 
     def pass_command(self, t_ns: int, tau: FloatArray, *, armed: bool) -> FloatArray:
         """What the motors get of a command tau (6,) that came at simulation time t_ns."""
-        _pass_packed(self.packed, t_ns, tau, armed)
+        pass_command(self.packed[0], t_ns, tau, armed)
         return self.allowed.copy()
 
     def stale_output(self, t_ns: int) -> tuple[int, FloatArray] | None:
         """(time it begins to act, safe tau) once per outage, where the last command is too old at t_ns; else None."""
-        since_ns = _expired_packed(self.packed, t_ns)
+        since_ns = expired_ns(self.packed[0], t_ns)
         return None if since_ns < 0 else (since_ns, self._safe.copy())

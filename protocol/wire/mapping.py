@@ -154,33 +154,6 @@ def command_from_wire(control: float, scale: float) -> float:
     return control * scale
 
 
-@compiled
-def _fill_pose_packed(message: Packed, t_us: int, q: FloatArray) -> None:
-    fill_pose(message[0], t_us, q)
-
-
-@compiled
-def _fill_tick_packed(message: Packed, t_us: int, readings: FloatArray) -> None:
-    fill_tick(message[0], t_us, readings)
-
-
-@compiled
-def _fill_command_packed(
-    message: Packed, t_us: int, tau: FloatArray, scale: FloatArray, armed: bool, lockstep: bool
-) -> None:
-    fill_command(message[0], t_us, tau, scale, armed, lockstep)
-
-
-@compiled
-def _read_pose_packed(message: Packed, q: FloatArray) -> bool:
-    return read_pose(message[0], q)
-
-
-@compiled
-def _read_command_packed(message: Packed, scale: FloatArray, tau: FloatArray) -> bool:
-    return read_command(message[0], scale, tau)
-
-
 def _structure(message: Layout, payload: bytes) -> Packed:
     """A payload as the structure of its message; zeros that were cut off return."""
     return np.frombuffer(payload.ljust(message.size, b"\0"), message.dtype, 1)
@@ -189,14 +162,14 @@ def _structure(message: Layout, payload: bytes) -> Packed:
 def encode_pose(t_ns: int, q: FloatArray) -> bytes:
     """ATT_POS_MOCAP payload of the position and attitude q (6,)."""
     message = np.zeros(1, POSE.dtype)
-    _fill_pose_packed(message, t_ns // 1000, q)
+    fill_pose(message[0], t_ns // 1000, q)
     return message.tobytes()
 
 
 def decode_pose(payload: bytes) -> PositionSample | None:
     """The sample, or None where a position is not finite or the quaternion not of unit length."""
     message, q = _structure(POSE, payload), np.empty(6)
-    return PositionSample(int(message["time_usec"][0]) * 1000, q) if _read_pose_packed(message, q) else None
+    return PositionSample(int(message["time_usec"][0]) * 1000, q) if read_pose(message[0], q) else None
 
 
 def encode_tick(t_ns: int, readings: FloatArray) -> bytes:
@@ -206,7 +179,7 @@ def encode_tick(t_ns: int, readings: FloatArray) -> bytes:
     absolute and differential pressure (hPa), pressure altitude (m), temperature (Celsius).
     """
     message = np.zeros(1, TICK.dtype)
-    _fill_tick_packed(message, t_ns // 1000, np.asarray(readings, dtype=float))
+    fill_tick(message[0], t_ns // 1000, np.asarray(readings, dtype=float))
     return message.tobytes()
 
 
@@ -254,14 +227,14 @@ def encode_command(command: ActuatorCommand, scale: FloatArray, *, lockstep: boo
     """HIL_ACTUATOR_CONTROLS payload: fractions of the scale (6,); zeros when disarmed."""
     message = np.zeros(1, COMMAND.dtype)
     scale = np.asarray(scale, dtype=float)
-    _fill_command_packed(message, command.t_ns // 1000, command.tau, scale, command.armed, lockstep)
+    fill_command(message[0], command.t_ns // 1000, command.tau, scale, command.armed, lockstep)
     return message.tobytes()
 
 
 def decode_command(payload: bytes, scale: FloatArray) -> ActuatorCommand | None:
     """The command, or None where a control of the six is not finite; scale (6,)."""
     message, tau = _structure(COMMAND, payload), np.empty(6)
-    if not _read_command_packed(message, np.asarray(scale, dtype=float), tau):
+    if not read_command(message[0], np.asarray(scale, dtype=float), tau):
         return None
     return ActuatorCommand(int(message["time_usec"][0]) * 1000, tau, bool(message["mode"][0] & ARMED))
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common
 
+from bridge.parameter_server import BURST, ParameterServer
 from controller.laws.law import make_law
 from controller.laws.registry import LAWS, declared_gains
 from controller.laws.ude import UdeGains
 from controller.parameters import Parameters, changed, markdown_table, parameters_of, value_of
-from controller.station.parameter_server import BURST, ParameterServer
 from protocol.errors import ScenarioError, UsageError
 from protocol.messages import VEHICLE
 from protocol.scenario import Scenario, replace_gains

@@ -16,13 +16,13 @@ import pytest
 from bridge.links.memory import memory_pair
 from bridge.motor_bus.can_bus import CanBus
 from bridge.motor_bus.can_load import plan_bus
+from bridge.motor_bus.drives import RESEND_AFTER_S, CanMotors
 from bridge.process import StopFlag
 from bridge.shared_options import ClockMode
 from bridge.timing.clock import MonotonicClock
 from fwav_hil.bus_plot import plot_bus, read_encoders
 from fwav_hil.score import scores
 from fwav_hil.simulate import simulate
-from plant_emulator.drives.can_motors import RESEND_AFTER_S, CanMotors
 from plant_emulator.drives.motor_node import MotorNode
 from plant_emulator.drives.motor_process import MotorThread
 from plant_emulator.options import MotorLink
@@ -238,7 +238,7 @@ def test_in_real_time_drives_that_vanish_are_an_outage_with_safe_output_and_are_
 def test_in_real_time_drives_that_stay_away_disarm_and_end_the_run(
     rig: Callable[..., Rig], uri: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("plant_emulator.drives.can_motors.GIVE_UP_NS", 20_000_000)
+    monkeypatch.setattr("bridge.motor_bus.drives.GIVE_UP_NS", 20_000_000)
     one = rig(lockstep=False)
     with MotorThread(one.scenario, "odrive", uri):
         one.motors.meet(10.0)
@@ -339,7 +339,7 @@ class TestLockstepWithDrivesAway:
     def test_a_long_wait_is_told_to_those_who_wait_for_us(
         self, rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("plant_emulator.drives.can_motors.LONG_WAIT_S", 0.03)
+        monkeypatch.setattr("bridge.motor_bus.drives.LONG_WAIT_S", 0.03)
         one = rig()
         one.motors._waits_s = (0.01, 0.02, 0.03, 0.04)
         told: list[int] = []

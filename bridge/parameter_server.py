@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
-from controller.parameters import Parameters
 from protocol.wire import parameter_mapping
 from protocol.wire.codec import Frame
 from protocol.wire.parameter_mapping import Refusal, Wanted
@@ -13,6 +13,27 @@ from protocol.wire.schedule import Saying
 
 BURST = 16
 """Values of a list that are said at one occasion."""
+
+
+class ParameterTable(Protocol):
+    """The parameters of a component, in the order of their indices; `controller.parameters.Parameters` is one."""
+
+    @property
+    def table(self) -> Sequence[Any]:
+        """As many items as there are parameters."""
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """With parameters_set and parameters_refused."""
+
+    def index(self, name: str) -> int | None:
+        """The index of a name, or None."""
+
+    def saying(self, index: int) -> Saying:
+        """PARAM_VALUE of a parameter now."""
+
+    def set(self, index: int, kind: int, value: float, *, armed: bool) -> Refusal | None:
+        """Set a parameter; None where it now has the value, else why it has not."""
 
 
 class ParameterServer:
@@ -23,7 +44,7 @@ class ParameterServer:
 
     def __init__(
         self,
-        parameters: Parameters,
+        parameters: ParameterTable,
         who: tuple[int, int],
         is_armed: Callable[[], bool],
         on_change: Callable[[int], None],

@@ -7,7 +7,7 @@ from pathlib import Path
 import can
 import pytest
 
-from plant_emulator.drives.can_recorder import CanRecorder
+from bridge.motor_bus.can_recorder import CanRecorder
 from protocol.can_frame import CanFrame
 from protocol.errors import RunFolderError
 from tests.disk import small_disk
