@@ -48,7 +48,7 @@ def figures(protocol: str) -> Figures:
     host, drive = make_host(protocol, motor), make_drive(protocol, motor)
     frames = host.command(_TORQUE)
     encode = _processor_us(lambda: host.command(_TORQUE)) / len(frames)
-    decode = _processor_us(lambda: [drive.take(frame) for frame in frames]) / len(frames)
+    decode = _processor_us(lambda: [drive.decode(frame) for frame in frames]) / len(frames)
     bare, ours = [], []
     for _ in range(ROUNDS):
         bare.append(_exchange_us(protocol, bare=True))
@@ -149,6 +149,6 @@ def _answer_ours(protocol: str, port: int, ready: Any) -> None:
         for _ in range(EXCHANGES):
             for _ in range(count):
                 frame = bus.recv(1.0)
-                if frame is None or isinstance(drive.take(frame), Cause):
+                if frame is None or isinstance(drive.decode(frame), Cause):
                     return
             bus.send(_BACK)

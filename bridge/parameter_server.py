@@ -61,7 +61,7 @@ class ParameterServer:
             parameter_mapping.SET.message_id: (parameter_mapping.decode_set, self._set),
         }
 
-    def take(self, frame: Frame) -> bool:
+    def handle(self, frame: Frame) -> bool:
         """Take a frame of the protocol; whether it was one for this vehicle."""
         if frame.message_id not in self._handlers:
             return False

@@ -44,7 +44,7 @@ class Requests:
         }
         self.counters = {"requests": 0, "requests_refused": 0}
 
-    def take(self, frame: Frame) -> bool:
+    def handle(self, frame: Frame) -> bool:
         """Obey or refuse a COMMAND_LONG; whether it was one for this component."""
         if frame.message_id != mapping.COMMAND_LONG.message_id:
             return False

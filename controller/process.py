@@ -113,7 +113,7 @@ class Controller:
         late = self.session.is_silent and not self._lockstep
         data = self._receive(self.law.period_ns * 1e-9 if late else self._patience_s)
         if data:
-            self._take(data)
+            self._process(data)
             return
         self._count_silence(begun_ns)
         if not self._lockstep:
@@ -129,7 +129,7 @@ class Controller:
             self._ask_the_time(begun_ns)
             data = self._receive(wait_s)
             if data:
-                self._take(data)
+                self._process(data)
                 heard = True
         if not heard:
             self._count_silence(begun_ns)
@@ -146,14 +146,14 @@ class Controller:
         """Hear the link and the station, before the first sample."""
         data = self._receive(timeout_s)
         if data:
-            self._take(data)
+            self._process(data)
         if self.station:
             self.station.poll(0)
 
-    def _take(self, data: bytes) -> None:
+    def _process(self, data: bytes) -> None:
         """Have the tick take what came, then see to what can wait until the answer is on its way."""
         self.session.heard()
-        self.tick.take(data)
+        self.tick.process(data)
         if self.station and self.tick.answered_ns >= self._look_ns:
             self.station.poll_if_due(self.tick.answered_ns)
             self._look_ns = self.station.next_ns
@@ -243,7 +243,7 @@ def warm_up(scenario: Scenario, law: Law) -> None:
         source = HilSource(endpoint.reader, VEHICLE)
         sink = HilSink(endpoint.writer, lockstep=True)
         session = HilSession(endpoint, scenario.digest(), VEHICLE, arm=False, encoders=reference_encoders(law))
-        Tick(law, source, sink, session, endpoint.writer, near.send).take(pose + tick)
+        Tick(law, source, sink, session, endpoint.writer, near.send).process(pose + tick)
 
 
 def run_controller(scenario: Scenario, options: ControllerOptions, report: Report, stop: StopFlag) -> dict[str, Any]:

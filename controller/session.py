@@ -110,7 +110,7 @@ class HilSession:
 
     def hear(self, frame: Frame) -> None:
         """React to a frame that carries no pose. Raises ScenarioMismatchError."""
-        if self.requests.take(frame) or (frame.system, frame.component) != self.emulator:
+        if self.requests.handle(frame) or (frame.system, frame.component) != self.emulator:
             return
         if frame.message_id == mapping.VERSION.message_id:
             refuse_other_scenario("emulator", mapping.decode_version(frame.payload), self._digest)
@@ -120,7 +120,7 @@ class HilSession:
         elif frame.message_id == mapping.HEARTBEAT.message_id and mapping.heartbeat_is_ending(frame.payload):
             self.ended = True
         elif frame.message_id == mapping.TIMESYNC.message_id and self._time_sync:
-            answer = self._time_sync.take(frame, self._endpoint.link.received_ns)
+            answer = self._time_sync.handle(frame, self._endpoint.link.received_ns)
             if answer:
                 self._endpoint.send([answer])
 

@@ -67,7 +67,7 @@ class Tick:
         self._was_armed = False
         self.counters = {"repeated": 0, "skipped_samples": 0}
 
-    def take(self, data: bytes) -> None:
+    def process(self, data: bytes) -> None:
         """Take all that came, in its order on the wire. Raises what the session raises upon a frame."""
         source = self.source
         source.feed(data)

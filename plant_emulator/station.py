@@ -48,7 +48,7 @@ class EmulatorStation:
     def _hear(self, station: Station, t_ns: int) -> None:
         station.t_us = t_ns // 1000
         for frame in station.poll():
-            self.requests.take(frame)
+            self.requests.handle(frame)
 
     def _tell(self, station: Station, sayings: list[Saying]) -> None:
         for saying in sayings:

@@ -125,7 +125,7 @@ class Emulator:
     def hear(self, frames: list[Frame]) -> None:
         """React to frames that are no commands: requests are answered with the next tick."""
         for frame in frames:
-            self.requests.take(frame)
+            self.requests.handle(frame)
 
     def answers(self) -> list[Saying]:
         """What is to be answered before the first tick, where nothing else is due; the station is seen to as well."""

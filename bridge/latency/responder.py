@@ -27,7 +27,7 @@ def respond(link: Link, stop: StopFlag) -> None:
     while not stop.requested:
         for frame in endpoint.receive(_LOOK_S):
             if frame.message_id == mapping.TIMESYNC.message_id:
-                answer = time_sync.take(frame, clock.now_ns())
+                answer = time_sync.handle(frame, clock.now_ns())
                 if answer:
                     endpoint.send([answer])
 

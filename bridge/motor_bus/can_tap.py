@@ -77,7 +77,7 @@ class CanTap:
                 self._theirs.append(frame)
                 frames.append(frame)
             else:
-                self._requests.take(message)
+                self._requests.handle(message)
         self.counters["tap_refused"] += self._requests.counters["requests_refused"] - refused
         for saying in self._answers.answers():
             self._station.say(*saying)

@@ -174,7 +174,7 @@ class CanMotors:
                 )
             if self._is_hello(received) and self._syncs:
                 return
-            taken = self._host.take(received)
+            taken = self._host.decode(received)
             if not self._syncs and not isinstance(taken, Cause):
                 seen |= sum(1 << status.axis for status in taken)
                 if seen == ALL_AXES:
@@ -306,7 +306,7 @@ class CanMotors:
             self._answered = self._answered_enabled = 0
         if simulation_sync.is_simulation_only(frame):
             return
-        taken = self._host.take(frame)
+        taken = self._host.decode(frame)
         if isinstance(taken, Cause):
             self._counters[taken.value] += 1
             return

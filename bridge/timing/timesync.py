@@ -63,7 +63,7 @@ class TimeSync:
         self._asked.append(now_ns)
         return self._seal(mapping.TIMESYNC, mapping.encode_timesync(0, now_ns))
 
-    def take(self, frame: Frame, arrived_ns: int) -> bytes | None:
+    def handle(self, frame: Frame, arrived_ns: int) -> bytes | None:
         """Take a TIMESYNC that came at arrived_ns (0: now); the frame to answer a question with, else None."""
         arrived_ns = arrived_ns or self._clock.now_ns()
         answer_ns, asked_ns = mapping.decode_timesync(frame.payload)

@@ -48,8 +48,8 @@ class GroundStation:
                 refusal = encode_refusal(frame.payload, self._who, (frame.system, frame.component))
                 if refusal:
                     self._schedule.answer((FILE_TRANSFER, refusal))
-            elif not self._requests.take(frame):
-                self._parameters.take(frame)
+            elif not self._requests.handle(frame):
+                self._parameters.handle(frame)
         for saying in (*self._schedule.due(t_ns), *self._parameters.due()):
             self._station.say(*saying)
 

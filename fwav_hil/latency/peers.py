@@ -54,7 +54,7 @@ def probe_time_sync(
                 continue  # a line that gives back what is sent knows no time
             answer_ns, asked_ns = mapping.decode_timesync(frame.payload)
             if answer_ns == 0:  # the other end asks too
-                reply = others.take(frame, arrived_ns)
+                reply = others.handle(frame, arrived_ns)
                 if reply:
                     link.send(reply)
                 continue

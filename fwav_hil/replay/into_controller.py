@@ -65,7 +65,7 @@ def replay_in_process(run: Recorded) -> Difference:
             law.adopt(make_law(law.name, gains))
         recorded = run.commands.get(tick.t_ns)
         session.armed = recorded is None or is_armed(recorded)
-        controller.take(tick.datagram)
+        controller.process(tick.datagram)
     return compare_commands(run, answers)
 
 

@@ -107,7 +107,7 @@ class MotorNode:
         """What the drives say to a frame that came at wall time now_ns."""
         if simulation_sync.is_simulation_only(frame):
             return self._simulation_frame(frame, now_ns)
-        taken = self._drive.take(frame)
+        taken = self._drive.decode(frame)
         if isinstance(taken, Cause):
             self.counters[taken.value] += 1
             return []

@@ -69,7 +69,7 @@ class Lockstep(Pacing):
             data = self.endpoint.link.recv(timeout_s)
             came_ns = clock.now_ns()
             if data:
-                self.take(data, t_ns)
+                self.process(data, t_ns)
                 if source.newest_ns == t_ns:
                     self.latencies_ns.append(came_ns - self.sent_ns)
                     self.log_answer(t_ns)

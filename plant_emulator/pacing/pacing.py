@@ -97,7 +97,7 @@ class Pacing(abc.ABC):
         self.endpoint.link.send(self.datagram)
         self.owe_log(self.stamp_us(t_ns), frames)
 
-    def take(self, data: bytes, t_ns: int) -> None:
+    def process(self, data: bytes, t_ns: int) -> None:
         """Take all that came during the tick at t_ns, in its order: commands act, the rest is heard."""
         source = self.emulator.source
         source.feed(data)

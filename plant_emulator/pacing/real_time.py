@@ -85,12 +85,12 @@ class RealTime(Pacing):
                 if not data:
                     break
                 stamp_ns = link.received_ns
-                self._take_at(data, t_ns, stamp_ns + self._added_delay_ns if stamp_ns else self.clock.now_ns())
+                self._process_at(data, t_ns, stamp_ns + self._added_delay_ns if stamp_ns else self.clock.now_ns())
         else:
             while (wait_s := keeper.remaining_s()) is not None:
                 data = link.recv(wait_s)
                 if data:
-                    self._take_at(data, t_ns, self.clock.now_ns())
+                    self._process_at(data, t_ns, self.clock.now_ns())
             self._woke_ns = self.clock.now_ns()
             keeper.tick()
         if source.newest_ns < t_ns:
@@ -102,10 +102,10 @@ class RealTime(Pacing):
                 )
         self.emulator.check_staleness(t_ns + self.period_ns)
 
-    def _take_at(self, data: bytes, t_ns: int, came_ns: int) -> None:
+    def _process_at(self, data: bytes, t_ns: int, came_ns: int) -> None:
         """Take what came at came_ns, on the clock, during the period of the tick at t_ns."""
         self._came_ns, self._stamp_ns = came_ns, self.endpoint.link.received_ns
-        self.take(data, t_ns)
+        self.process(data, t_ns)
 
     def note_received(self) -> None:
         """Log what was read under the time it came."""
@@ -136,7 +136,7 @@ class RealTime(Pacing):
             if (frame.system, frame.component) == VEHICLE:
                 self._heard_ns = self.clock.now_ns()
                 if frame.message_id == mapping.TIMESYNC.message_id:
-                    answer = self.time_sync.take(frame, self._stamp_ns or self._came_ns)
+                    answer = self.time_sync.handle(frame, self._stamp_ns or self._came_ns)
                     if answer:
                         self._say(answer)
                     continue

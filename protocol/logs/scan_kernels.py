@@ -179,11 +179,13 @@ def scan_slice(
                 return True
             state[RESYNCHRONISATIONS] += 1
             state[SEARCH] = -1
-        take(data, at, verdict, stamp_size, state, frames)
+        accept_frame(data, at, verdict, stamp_size, state, frames)
 
 
 @compiled
-def take(data: Bytes, at: int, verdict: int, stamp_size: int, state: State, frames: npt.NDArray[np.void]) -> None:
+def accept_frame(
+    data: Bytes, at: int, verdict: int, stamp_size: int, state: State, frames: npt.NDArray[np.void]
+) -> None:
     """Write the row of the frame at `at`, and go on behind it."""
     floor = state[POSITION]
     reaches_back = at - stamp_size < floor and near(stamp_at(data, at - stamp_size), state[LAST_STAMP])

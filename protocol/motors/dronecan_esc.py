@@ -85,7 +85,7 @@ class _Receiver:
     def __init__(self) -> None:
         self._manager = transport.TransferManager()
 
-    def take(self, frame: CanFrame) -> Any:
+    def decode(self, frame: CanFrame) -> Any:
         """The transfer that the frame completes, None where it is not complete yet, or a Cause."""
         if not frame.data:
             return Cause.SHORT
@@ -128,14 +128,14 @@ class Host(motor_protocol.Host):
             return []
         return self._sender.broadcast(HOST_NODE, _node_status(t_ns, 0), LOW)
 
-    def take(self, frame: CanFrame) -> Sequence[Status] | Cause:
+    def decode(self, frame: CanFrame) -> Sequence[Status] | Cause:
         axis = (frame.can_id & 0x7F) - self.motor.first_node_id
         if not frame.extended or frame.remote or not 0 <= axis < DRIVES:
             return Cause.FOREIGN
         kind = frame.can_id >> 8 & 0xFFFF
         if frame.can_id & _SERVICE or kind not in (ESC_STATUS, NODE_STATUS):
             return Cause.UNKNOWN
-        transfer = self._receiver.take(frame)
+        transfer = self._receiver.decode(frame)
         if transfer is None or isinstance(transfer, Cause):
             return transfer or ()
         message = transfer.payload
@@ -165,14 +165,14 @@ class Drive(motor_protocol.Drive):
         self._node_status = Due(NODE_STATUS_RATE_HZ)
         self._status = Due(self.motor.status_rate_hz)
 
-    def take(self, frame: CanFrame) -> Sequence[Order] | Cause:
+    def decode(self, frame: CanFrame) -> Sequence[Order] | Cause:
         if not frame.extended or frame.remote or frame.can_id & 0x7F == 0:
             return Cause.FOREIGN
         if frame.can_id & _SERVICE:
             return self._take_request(frame)
         if frame.can_id >> 8 & 0xFFFF != RAW_COMMAND:
             return Cause.FOREIGN
-        transfer = self._receiver.take(frame)
+        transfer = self._receiver.decode(frame)
         if transfer is None or isinstance(transfer, Cause):
             return transfer or ()
         orders = []
@@ -189,7 +189,7 @@ class Drive(motor_protocol.Drive):
         if frame.can_id >> 16 & 0xFF != GET_NODE_INFO:
             return Cause.UNKNOWN
         # A request without content is a frame of just the tail byte, which the library's Transfer takes.
-        transfer = self._receiver.take(frame)
+        transfer = self._receiver.decode(frame)
         if transfer is None or isinstance(transfer, Cause):
             return transfer or ()
         return (Order(Action.ASK, axis, detail=transfer),)

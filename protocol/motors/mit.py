@@ -91,7 +91,7 @@ class Host(motor_protocol.Host):
             for drive, value in zip(self._ids, torque.tolist(), strict=True)
         ]
 
-    def take(self, frame: CanFrame) -> Sequence[Status] | Cause:
+    def decode(self, frame: CanFrame) -> Sequence[Status] | Cause:
         if frame.extended or frame.remote or frame.can_id != MASTER:
             return Cause.FOREIGN
         motor, data = self.motor, frame.data
@@ -131,7 +131,7 @@ class Drive(motor_protocol.Drive):
     def restart(self) -> None:
         """There is no schedule."""
 
-    def take(self, frame: CanFrame) -> Sequence[Order] | Cause:
+    def decode(self, frame: CanFrame) -> Sequence[Order] | Cause:
         axis, data, motor = frame.can_id - self.motor.first_node_id, frame.data, self.motor
         if frame.extended or not 0 <= axis < DRIVES:
             return Cause.FOREIGN

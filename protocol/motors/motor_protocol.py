@@ -151,7 +151,7 @@ class Host(abc.ABC):
         return []
 
     @abc.abstractmethod
-    def take(self, frame: CanFrame) -> Sequence[Status] | Cause:
+    def decode(self, frame: CanFrame) -> Sequence[Status] | Cause:
         """What a frame from the bus says of the drives, or why it was not taken."""
 
 
@@ -162,7 +162,7 @@ class Drive(abc.ABC):
         self.motor = motor
 
     @abc.abstractmethod
-    def take(self, frame: CanFrame) -> Sequence[Order] | Cause:
+    def decode(self, frame: CanFrame) -> Sequence[Order] | Cause:
         """The orders in a frame from the bus, or why it was not taken."""
 
     @abc.abstractmethod

@@ -89,7 +89,7 @@ class Host(motor_protocol.Host):
             for can_id, value in zip(self._torque_ids, torque.tolist(), strict=True)
         ]
 
-    def take(self, frame: CanFrame) -> Sequence[Status] | Cause:
+    def decode(self, frame: CanFrame) -> Sequence[Status] | Cause:
         axis = (frame.can_id >> 5) - self.motor.first_node_id
         if frame.extended or frame.remote or not 0 <= axis < DRIVES:
             return Cause.FOREIGN
@@ -130,7 +130,7 @@ class Drive(motor_protocol.Drive):
             (Due(motor.status_rate_hz), (GET_IQ, GET_TEMPERATURE, GET_BUS_VOLTAGE_CURRENT)),
         )
 
-    def take(self, frame: CanFrame) -> Sequence[Order] | Cause:
+    def decode(self, frame: CanFrame) -> Sequence[Order] | Cause:
         axis = (frame.can_id >> 5) - self.motor.first_node_id
         if frame.extended or not 0 <= axis < DRIVES:
             return Cause.FOREIGN

@@ -51,7 +51,7 @@ def said(one: One, t_ns: int) -> list[str]:
 
 
 def result(one: One, frame: Frame) -> Result:
-    assert one.requests.take(frame)
+    assert one.requests.handle(frame)
     ((message, payload),) = one.schedule.answers()
     values = message.unpack_fields(payload)
     assert message.name == "COMMAND_ACK"
@@ -90,7 +90,7 @@ def test_minus_one_ends_a_stream_and_zero_brings_the_default_back() -> None:
 def test_once_is_once() -> None:
     one = new()
     assert result(one, command(512, STATE)) is Result.ACCEPTED
-    one.requests.take(command(512, STATE))
+    one.requests.handle(command(512, STATE))
     assert said(one, 4 * MS) == ["115@4", "331@4"]
     assert said(one, 8 * MS) == []
 
@@ -121,17 +121,17 @@ def test_other_commands_go_to_their_handlers_or_are_unknown() -> None:
 @pytest.mark.parametrize("target", [(2, 191), (1, 1)])
 def test_requests_to_others_are_left_alone(target: tuple[int, int]) -> None:
     one = new()
-    assert not one.requests.take(command(511, STATE, 5000.0, target=target))
+    assert not one.requests.handle(command(511, STATE, 5000.0, target=target))
     assert one.schedule.answers() == []
     assert one.requests.counters == {"requests": 0, "requests_refused": 0}
 
 
 @pytest.mark.parametrize("target", [(0, 0), (1, 0), (0, 191)])
 def test_zero_means_everybody(target: tuple[int, int]) -> None:
-    assert new().requests.take(command(511, STATE, 5000.0, target=target))
+    assert new().requests.handle(command(511, STATE, 5000.0, target=target))
 
 
 def test_answers_come_first() -> None:
     one = new()
-    one.requests.take(command(512, STATE))
+    one.requests.handle(command(512, STATE))
     assert [message.name for message, _ in one.schedule.due(0)] == ["COMMAND_ACK", "DEBUG", "DEBUG"]

@@ -34,7 +34,7 @@ def orders_of(drive: Drive, frames: list[CanFrame]) -> list[Order]:
     """All orders in frames that must all be taken."""
     orders: list[Order] = []
     for frame in frames:
-        taken = drive.take(frame)
+        taken = drive.decode(frame)
         assert not isinstance(taken, Cause), (frame, taken)
         orders += taken
     return orders
@@ -74,7 +74,7 @@ class MotorProtocolContract:
         rng = np.random.default_rng(2)
         for _ in range(2000):
             frame = random_frame(rng)
-            for taken in (host.take(frame), drive.take(frame)):
+            for taken in (host.decode(frame), drive.decode(frame)):
                 assert isinstance(taken, Cause | tuple | list)
 
     def test_damaged_frames_of_our_own_are_no_exception(self) -> None:
@@ -85,8 +85,8 @@ class MotorProtocolContract:
         for _ in range(2000):
             frame = frames[rng.integers(len(frames))]
             damaged = frame._replace(data=rng.bytes(int(rng.integers(LONGEST_DATA + 1))))
-            host.take(damaged)
-            taken = drive.take(damaged)
+            host.decode(damaged)
+            taken = drive.decode(damaged)
             if not isinstance(taken, Cause):
                 assert all(np.isfinite(order.torque) for order in taken)
 
@@ -95,9 +95,9 @@ class MotorProtocolContract:
         host, drive = self.ends()
         readings = [Reading(torque=0.25, temperature_celsius=30.0)] * DRIVES
         for frame in drive.cyclic(0, readings):
-            assert isinstance(drive.take(frame), Cause)
+            assert isinstance(drive.decode(frame), Cause)
         for frame in [*host.enable(), *host.command(np.zeros(DRIVES))]:
-            assert isinstance(host.take(frame), Cause)
+            assert isinstance(host.decode(frame), Cause)
 
     def test_nothing_meets_the_frames_of_the_simulation(self) -> None:
         host, drive = self.ends(Motor(first_node_id=38))
@@ -114,7 +114,7 @@ class MotorProtocolContract:
             frames += drive.reply(order, reading)
         heard: dict[str, float] = {}
         for frame in frames:
-            taken = host.take(frame)
+            taken = host.decode(frame)
             assert not isinstance(taken, Cause), frame
             for status in taken:
                 assert 0 <= status.axis < DRIVES

@@ -47,7 +47,7 @@ class Peer:
 
     def ask(self, message: Any) -> bool:
         (frame,) = self._reader.read(message.pack(self._mavlink))
-        return self.server.take(frame)
+        return self.server.handle(frame)
 
     def hear(self) -> list[Any]:
         data = b"".join(self._writer.seal(*saying) for saying in self.server.due())

@@ -71,7 +71,7 @@ def test_as_a_process_it_names_its_link_answers_and_ends_when_told() -> None:
             sync = TimeSync(station.seal, clock)
             station.send([sync.question()])
             for frame in station.receive(PATIENCE_S):
-                sync.take(frame, clock.now_ns())
+                sync.handle(frame, clock.now_ns())
         assert sync.estimate is not None
         assert abs(sync.estimate.offset_ns) <= sync.estimate.error_ns, "both have the one clock of this machine"
         process.send_signal(signal.SIGTERM)

@@ -49,7 +49,7 @@ def test_a_question_holds_our_time_and_nothing_else(endpoint: Endpoint) -> None:
 
 def test_a_question_is_answered_with_its_own_time_beside_ours(endpoint: Endpoint) -> None:
     clock = VirtualClock(START_NS)
-    reply = TimeSync(endpoint.seal, clock).take(answer(endpoint, 0, 77), START_NS)
+    reply = TimeSync(endpoint.seal, clock).handle(answer(endpoint, 0, 77), START_NS)
     assert reply is not None
     assert times_in(reply) == (START_NS, 77)
 
@@ -75,7 +75,7 @@ def test_the_offset_is_wrong_by_no_more_than_its_bound(offset_ns: int, there_ns:
         asked_ns = clock.now_ns()
         sync.question()
         said = answer(endpoint, asked_ns + there_ns + offset_ns, asked_ns)
-        assert sync.take(said, asked_ns + there_ns + back_ns) is None
+        assert sync.handle(said, asked_ns + there_ns + back_ns) is None
         found = sync.estimate
     assert found is not None
     assert found.round_trip_ns == there_ns + back_ns
@@ -92,7 +92,7 @@ def test_the_quickest_answer_is_believed(endpoint: Endpoint) -> None:
         asked_ns = clock.now_ns()
         sync.question()
         clock.advance_ns(late_ns)
-        sync.take(answer(endpoint, asked_ns + 1000, asked_ns), clock.now_ns())
+        sync.handle(answer(endpoint, asked_ns + 1000, asked_ns), clock.now_ns())
     assert sync.estimate == Estimate(1000 - MS // 2, MS, 3)
 
 
@@ -104,7 +104,7 @@ def test_an_old_quick_answer_does_not_stand_for_ever(endpoint: Endpoint) -> None
         asked_ns = clock.now_ns()
         sync.question()
         clock.advance_ns(round_trip_ns)
-        sync.take(answer(endpoint, asked_ns + round_trip_ns // 2, asked_ns), clock.now_ns())
+        sync.handle(answer(endpoint, asked_ns + round_trip_ns // 2, asked_ns), clock.now_ns())
     assert sync.estimate == Estimate(0, MS, 17)
 
 
@@ -113,10 +113,10 @@ def test_an_answer_counts_once_and_only_to_a_question_of_ours(endpoint: Endpoint
     sync = TimeSync(endpoint.seal, clock)
     sync.question()
     clock.advance_ns(MS)
-    assert sync.take(answer(endpoint, 5, START_NS + 1), clock.now_ns()) is None, "never asked"
+    assert sync.handle(answer(endpoint, 5, START_NS + 1), clock.now_ns()) is None, "never asked"
     assert sync.estimate is None
     for tc1 in (START_NS, START_NS + 999):
-        sync.take(answer(endpoint, tc1, START_NS), clock.now_ns())
+        sync.handle(answer(endpoint, tc1, START_NS), clock.now_ns())
     assert sync.estimate == Estimate(-MS // 2, MS, 1), "the second was said again"
 
 
@@ -124,14 +124,14 @@ def test_an_answer_from_before_its_question_is_not_believed(endpoint: Endpoint) 
     """A kernel stamp may be off where the wall clock was set meanwhile."""
     sync = TimeSync(endpoint.seal, VirtualClock(START_NS))
     sync.question()
-    sync.take(answer(endpoint, START_NS, START_NS), START_NS - 1)
+    sync.handle(answer(endpoint, START_NS, START_NS), START_NS - 1)
     assert sync.estimate is None
 
 
 def test_another_clock_may_run_before_zero(endpoint: Endpoint) -> None:
     sync = TimeSync(endpoint.seal, VirtualClock(START_NS))
     sync.question()
-    sync.take(answer(endpoint, -5, START_NS), START_NS)
+    sync.handle(answer(endpoint, -5, START_NS), START_NS)
     assert sync.estimate == Estimate(-5 - START_NS, 0, 1)
 
 

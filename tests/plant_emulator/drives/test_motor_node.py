@@ -188,7 +188,7 @@ def test_a_status_says_what_happened(bench: Bench) -> None:
 
 
 def _taken(host: Host, frame: CanFrame) -> list[Any]:
-    taken = host.take(frame)
+    taken = host.decode(frame)
     return list(taken) if isinstance(taken, tuple | list) else []
 
 

@@ -128,8 +128,8 @@ def test_damage_has_a_cause_and_the_next_command_is_taken() -> None:
     host, drive = motor_dronecan.Host(MOTOR), motor_dronecan.Drive(MOTOR)
     first, second = host.command(np.full(6, 0.5))
     damaged = first._replace(data=bytes((first.data[0] ^ 1, *first.data[1:])))
-    assert drive.take(damaged) == ()
-    assert drive.take(second) is Cause.MALFORMED
-    assert drive.take(second) is Cause.MALFORMED  # an end without a start
+    assert drive.decode(damaged) == ()
+    assert drive.decode(second) is Cause.MALFORMED
+    assert drive.decode(second) is Cause.MALFORMED  # an end without a start
     assert len([o for o in orders_of(drive, host.command(np.full(6, 0.5))) if o.action is Action.TORQUE]) == 6
-    assert drive.take(CanFrame(first.can_id, b"", extended=True)) is Cause.SHORT
+    assert drive.decode(CanFrame(first.can_id, b"", extended=True)) is Cause.SHORT

@@ -40,7 +40,7 @@ class TestContractWithShortReplies(MotorProtocolContract):
             orders = orders_of(drive, host.command(np.zeros(6)))
             replies = [frame for order in orders for frame in drive.reply(order, Reading(torque=0.5, position=-1.0))]
             assert {len(reply.data) for reply in replies} == {length}
-            heard = [status for reply in replies for status in host.take(reply)]  # type: ignore[union-attr]
+            heard = [status for reply in replies for status in host.decode(reply)]  # type: ignore[union-attr]
             assert [status.axis for status in heard] == [0, 1, 2, 3, 4, 5], named
             assert all(status.torque == pytest.approx(0.5, abs=3e-4) for status in heard)
             assert all(status.position == pytest.approx(-1.0, abs=2e-4) for status in heard)
@@ -111,7 +111,7 @@ def test_each_frame_to_a_drive_has_one_reply(data: bytes) -> None:
     ],
 )
 def test_what_a_drive_does_not_take_has_a_cause(frame: CanFrame, cause: Cause) -> None:
-    assert motor_mit.Drive(MOTOR).take(frame) is cause
+    assert motor_mit.Drive(MOTOR).decode(frame) is cause
 
 
 def test_a_full_scale_that_the_frames_cannot_carry_is_refused() -> None:

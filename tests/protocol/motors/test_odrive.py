@@ -101,7 +101,7 @@ def test_readings_are_asked_for_by_remote_frames() -> None:
         (reply,) = drive.reply(order, READING)
         assert reply.can_id == 4 << 5 | message
         assert len(reply.data) == 8
-    assert drive.take(CanFrame(4 << 5 | 0x0E, remote=True)) is Cause.UNKNOWN
+    assert drive.decode(CanFrame(4 << 5 | 0x0E, remote=True)) is Cause.UNKNOWN
     assert drive.reply(Order(Action.TORQUE, 1, 0.5), READING) == ()  # commands have no reply
 
 
@@ -128,4 +128,4 @@ def test_cyclic_messages_keep_their_periods() -> None:
     ],
 )
 def test_what_a_drive_does_not_take_has_a_cause(frame: CanFrame, cause: Cause) -> None:
-    assert motor_odrive.Drive(MOTOR).take(frame) is cause
+    assert motor_odrive.Drive(MOTOR).decode(frame) is cause
