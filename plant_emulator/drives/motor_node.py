@@ -94,7 +94,7 @@ class MotorNode:
             if now_ns - self._heard_ns < (RUN_OVER_NS if self._host_waits else HOST_GONE_NS):
                 return []
             self.counters["lost_hosts"] += 1
-            self._run_is_over = self._host_waits
+            self._run_is_over = True
             self._use_own_time(now_ns)
         passed_ns = now_ns - self._heard_ns
         if passed_ns < OWN_STEP_NS:

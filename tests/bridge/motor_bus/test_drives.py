@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -248,6 +249,45 @@ def test_in_real_time_drives_that_stay_away_disarm_and_end_the_run(
             one.tick()
 
 
+@pytest.mark.parametrize("lockstep", [True, False])
+def test_the_drives_are_told_whether_time_waits_for_them(rig: Callable[..., Rig], uri: str, lockstep: bool) -> None:
+    one = rig(lockstep=lockstep)
+    syncs = []
+    one.motors.watches.append(lambda _, frame: syncs.append(sync) if (sync := decode_sync(frame)) else None)
+    with MotorThread(one.scenario, "odrive", uri):
+        one.motors.meet(10.0)
+        one.tick()
+    assert [sync.lockstep for sync in syncs] == [lockstep]
+
+
+def answers(tick: int, u: float, *, enabled: bool = True) -> list[CanFrame]:
+    """What six drives say to the SYNC of a tick."""
+    return [encode_answer(axis, tick, u, enabled=enabled) for axis in range(6)]
+
+
+@contextmanager
+def script(one: Rig, said: list[list[CanFrame]]) -> Iterator[None]:
+    """Drives that say this, item by item, to each SYNC that they hear, and then no more."""
+    one.motors._waits_s = (0.05,) * 200
+    ending = threading.Event()
+
+    def speak() -> None:
+        with CanBus(one.bus.uri.text, 1_000_000) as bus:
+            while not ending.is_set():
+                frame = bus.recv(0.05)
+                if frame is not None and decode_sync(frame) and said:
+                    for answer in said.pop(0):
+                        bus.send(answer)
+
+    thread = threading.Thread(target=speak)
+    thread.start()
+    try:
+        yield
+    finally:
+        ending.set()
+        thread.join(10.0)
+
+
 class TestLockstepWithDrivesAway:
     """Simulation time stands still: how long the drives are away changes nothing but the number of repetitions."""
 
@@ -361,35 +401,31 @@ class TestLockstepWithDrivesAway:
                 one.motors._waits_s = (0.02,) * 500
                 one.tick()
 
-    def test_what_the_lost_ones_had_answered_is_void(self, rig: Callable[..., Rig], uri: str) -> None:
+    def test_what_the_lost_ones_had_answered_is_void(self, rig: Callable[..., Rig]) -> None:
         """Three axes answered before the process was killed; the one that takes its place answers for all six."""
         one = rig()
-        one.motors._waits_s = (0.05,) * 100
-        digest = one.scenario.drive_digest()
-        said = [
-            [encode_answer(axis, 0, 1.0, enabled=True) for axis in range(6)],
-            [encode_answer(axis, 1, 2.0, enabled=True) for axis in range(3)],
-            [encode_hello(digest, drives=True), *(encode_answer(axis, 1, 3.0, enabled=False) for axis in range(6))],
-        ]
-        ending = threading.Event()
-
-        def speak() -> None:
-            with CanBus(uri, 1_000_000) as bus:
-                while not ending.is_set():
-                    frame = bus.recv(0.05)
-                    if frame is not None and decode_sync(frame) and said:
-                        for answer in said.pop(0):
-                            bus.send(answer)
-
-        thread = threading.Thread(target=speak)
-        thread.start()
-        try:
+        hello = encode_hello(one.scenario.drive_digest(), drives=True)
+        said = [answers(0, 1.0), answers(1, 2.0)[:3], [hello, *answers(1, 3.0, enabled=False)]]
+        with script(one, said):
             assert one.tick().tolist() == [1.0] * 6
             assert one.tick().tolist() == [3.0] * 6
-        finally:
-            ending.set()
-            thread.join(10.0)
         assert one.counted()["motor_outages"] == 1
+
+    def test_drives_that_let_go_later_are_no_second_outage(self, rig: Callable[..., Rig]) -> None:
+        one = rig()
+        hello = encode_hello(one.scenario.drive_digest(), drives=True)
+        with script(one, [answers(0, 1.0), [hello, *answers(1, 0.0, enabled=False)], answers(2, 0.0, enabled=False)]):
+            for _ in range(3):
+                one.tick()
+        assert one.counted()["motor_outages"] == 1
+        assert one.counted()["motor_safe_ticks"] == 2
+
+    def test_a_hello_that_is_late_when_a_run_begins_is_no_outage(self, rig: Callable[..., Rig]) -> None:
+        one = rig()
+        hello = encode_hello(one.scenario.drive_digest(), drives=True)
+        with script(one, [[hello, *answers(0, 0.0, enabled=False)]]):
+            one.tick()
+        assert "motor_outages" not in one.counted()
 
     def test_a_hello_that_somebody_else_asked_for_changes_nothing(self, rig: Callable[..., Rig], uri: str) -> None:
         one = rig()

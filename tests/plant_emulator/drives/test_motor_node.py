@@ -152,6 +152,9 @@ def test_a_host_silent_in_lockstep_changes_nothing_until_its_run_is_over(bench: 
     assert bench.torques() == [0.0] * 6
     assert not any(decode_answer(frame) for frame in bench.tick())
     assert bench.node.counters["refused_syncs"] == 1
+    bench.enable()
+    assert any(decode_answer(frame) for frame in bench.tick(lockstep=False)), "in real time a first SYNC may be lost"
+    bench.wait(RUN_OVER_NS)
     bench.enable()  # another run begins
     bench.say([encode_hello(bench.scenario.drive_digest(), drives=False)])
     bench.t_ns = -PERIOD_NS
