@@ -33,8 +33,7 @@ def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     """`fwav-hil log ...` in this process and in tmp_path, without a terminal; nothing about compiling is said."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "160")
-    monkeypatch.setattr("fwav_hil.logs.choice.cache_folder", lambda: tmp_path)
-    (tmp_path / "warm-logs").touch()
+    monkeypatch.setattr("fwav_hil.logs.choice.kernels_are_warm", lambda *_packages: True)
 
     def call(*arguments: str | Path) -> Ended:
         code = run_command(cli, "fwav-hil", ["log", *map(str, arguments)])
