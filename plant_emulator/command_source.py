@@ -57,12 +57,12 @@ def receive(
         echo_us = np.int64(s.command.time_usec)
         if not read_command(s.command, s.scale, s.tau):
             counters[REFUSED] += 1
-        elif echo_us == s.newest_us:
-            counters[REPEATED] += 1
-        elif 0 <= echo_us < max(oldest_us, s.newest_us):
-            counters[OLD] += 1
         elif echo_us < 0 or echo_us > latest_us or echo_us % s.period_us:
             counters[UNKNOWN_ECHO] += 1
+        elif echo_us == s.newest_us:
+            counters[REPEATED] += 1
+        elif echo_us < max(oldest_us, s.newest_us):
+            counters[OLD] += 1
         else:
             if s.newest_us < 0:  # the controller's numbers restart with its first answer
                 r.follow = 1
