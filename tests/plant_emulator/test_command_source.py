@@ -260,12 +260,6 @@ class TestOthers:
         end.hear(frame)
         assert end.source.raws == [frame]
 
-    def test_what_stands_around_a_command_and_is_no_frame_is_not_kept(self, writer: FrameWriter) -> None:
-        end = End(is_datagram=False)
-        frame, other = command(writer, 0), command(writer, PERIOD_NS)
-        end.hear(b"\1\2" + frame, other + b"\3")
-        assert end.source.raws == [frame, other]
-
     @pytest.mark.parametrize("count", [62, 63, 64, 65, 200])
     def test_any_number_of_them_is_heard_and_kept(self, end: End, writer: FrameWriter, count: int) -> None:
         beats = [beat(writer) for _ in range(count)]
