@@ -113,6 +113,7 @@ class CommandSource:
         )
         self._arguments = (reader.reading, reader.table, self._rows, self._memory)
         self._oldest_us = self._latest_us = 0
+        self._offsets = self._rows["offset"]
         self._data = b""
         self._at = 0
         self.newest: FloatArray = self._memory["newest"][0]
@@ -133,7 +134,7 @@ class CommandSource:
         )
         self.newest_ns = newest_us * 1000
         self.is_read = self._at == len(data)
-        if count == 1 and found == COMMANDED and not begun and self.is_read:
+        if count == 1 and found == COMMANDED and self.is_read and not self._offsets.item(0):
             self.raws.append(data)  # as nearly always
             return Found.COMMAND
         if count:

@@ -177,6 +177,7 @@ class FrameReader:
         )
         self.table = link_table()
         self.rows = np.zeros(_AT_ONCE, dtype=framing.ROW)
+        self._offsets = self.rows["offset"]
         self._is_datagram = is_datagram
         self._rest = b""
         self._counted, self._next = self.reading["counters"][0], self.reading["next"][0]
@@ -208,7 +209,12 @@ class FrameReader:
         """The intact frames in `data`; on a stream link, a frame begun in one call is completed in the next."""
         data = self.whole(data)
         count, at = framing.read_frames(data, 0, self.reading, self.table, self.rows)
-        if count == 1 and data[0] == MAGIC_V2 and len(data) == data[1] + HEADER_V2 + CRC_SIZE:
+        if (
+            count == 1
+            and data[0] == MAGIC_V2
+            and len(data) == data[1] + HEADER_V2 + CRC_SIZE
+            and not self._offsets.item(0)
+        ):
             return [lone_frame(data)]  # as nearly always
         frames = [frame_of(data, row) for row in self.rows[:count].tolist()]
         while at >= 0:

@@ -49,7 +49,7 @@ class End:
         for datagram in datagrams:
             self.near.send(datagram)
         while (data := self._far.recv(0.0)) is not None:
-            self.tick.take(data)
+            self.tick.process(data)
         return self.answers()
 
     def answers(self) -> list[bytes]:

@@ -260,6 +260,19 @@ class TestOthers:
         end.hear(frame)
         assert end.source.raws == [frame]
 
+    def test_what_stands_around_a_command_and_is_no_frame_is_not_kept(self, writer: FrameWriter) -> None:
+        end = End(is_datagram=False)
+        frame, other = command(writer, 0), command(writer, PERIOD_NS)
+        end.hear(b"\1\2" + frame, other + b"\3")
+        assert end.source.raws == [frame, other]
+
+    def test_a_damaged_frame_in_front_of_a_command_is_not_kept(self, end: End, writer: FrameWriter) -> None:
+        damaged = bytearray(beat(writer))
+        damaged[12] ^= 1
+        frame = command(writer, 0)
+        assert end.hear(bytes(damaged) + frame) == [0]
+        assert end.source.raws == [frame]
+
     @pytest.mark.parametrize("count", [62, 63, 64, 65, 200])
     def test_any_number_of_them_is_heard_and_kept(self, end: End, writer: FrameWriter, count: int) -> None:
         beats = [beat(writer) for _ in range(count)]

@@ -283,6 +283,15 @@ class TestReaderOnAStream:
         assert [frame.raw for frame in found] == FRAMES[1:]
         assert reader.counters["bad_crc"] == 1
 
+    def test_a_frame_that_ends_a_bad_one_is_handed_on_and_the_bad_one_is_not(self) -> None:
+        """The bad one says that it ends where the bytes do, and its checksum is that of the frame within it."""
+        inner = FRAMES[3]
+        payload = bytes(20) + inner[:-2]
+        outer = b"\xfd" + struct.pack("<BBBBBBHB", len(payload), 0, 0, 0, 1, 1, 110, 0) + payload + inner[-2:]
+        frames, counted = _read(outer, is_datagram=False)
+        assert [frame.raw for frame in frames] == [inner]
+        assert counted["bad_crc"] == 1
+
 
 class TestReaderOnDatagrams:
     def test_several_frames_of_a_datagram_come_in_order(self) -> None:
