@@ -4,28 +4,41 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
+from bridge.endpoint import Endpoint
 from bridge.links.link import Link, open_link
 from bridge.links.memory import memory_pair
 from bridge.links.tcp import TcpIn
 from bridge.links.udp import UdpIn
+from bridge.process import StopFlag
+from bridge.timing.clock import VirtualClock
+from bridge.timing.rate import RateKeeper
 from fwav_hil.simulate import simulate
+from plant_emulator.pacing.lockstep import RESEND_AFTER_S, Lockstep
+from plant_emulator.pacing.pacing import Parts
 from plant_emulator.plant.truth import load_truth
+from plant_emulator.process import warm_up
+from plant_emulator.tick import Emulator
 from protocol.errors import (
     DivergenceError,
+    Interrupted,
     PeerLostError,
     PeerMissingError,
     RunFolderError,
     ScenarioMismatchError,
 )
-from protocol.logs.tlog import read_tlog
+from protocol.logs.tlog import TlogWriter, read_tlog
+from protocol.messages import VEHICLE, FloatArray
 from protocol.wire import mapping
-from protocol.wire.codec import FrameWriter
+from protocol.wire.codec import Frame, FrameWriter
 from protocol.wire.requests import ARM_DISARM
+from tests.frames import command_frame
 from tests.loop import fly_both, scenario_of
+from tests.plant_emulator.pacing.scripted import Scripted
 
 SHORT = scenario_of("flapper", duration_s=0.4)
 
@@ -265,3 +278,221 @@ def test_a_divergence_is_named_and_logged_up_to_there(tmp_path: Path) -> None:
     simulated = simulate(scenario)
     assert simulated.divergence
     assert np.array_equal(load_truth(tmp_path / "ground_truth.npy")["q"], simulated.q)
+
+
+PERIOD_NS = SHORT.period_ns
+SCALE = np.array(SHORT.actuators.scale)
+TAU = np.array([0.25, -0.25, 0.5, 0.1, -0.1, 0.2]) * SCALE
+MS = 1_000_000
+
+
+class Flown(NamedTuple):
+    """Some ticks of lockstep before a script, on a clock that moves only while one waits."""
+
+    pacing: Lockstep
+    emulator: Emulator
+    link: Scripted
+    kept: list[Frame]
+
+
+def command(writer: FrameWriter, tick: int, tau: FloatArray = TAU, *, armed: bool = True) -> bytes:
+    return command_frame(writer, tick * PERIOD_NS, tau, SCALE, armed=armed)
+
+
+def beat(writer: FrameWriter) -> bytes:
+    return writer.seal(mapping.HEARTBEAT, mapping.encode_controller_heartbeat(armed=True))
+
+
+def fly_script(
+    path: Path, ticks: int, script: Callable[[FrameWriter, int], list[bytes]], *, speed: float = 0.0
+) -> Flown:
+    """`script` says what comes 1 ms, 2 ms ... after the datagram of that number: a tick, or one sent again."""
+    warm_up(SHORT)
+    clock, writer = VirtualClock(10**12), FrameWriter(*VEHICLE)
+    link = Scripted(clock, lambda number: script(writer, number))
+    endpoint = Endpoint(link, 1, SHORT.wire.emulator_component)
+    emulator = Emulator(SHORT, endpoint, None)
+    keeper = RateKeeper(clock, round(PERIOD_NS / speed)) if speed else None
+    with TlogWriter(path) as log:
+        parts = Parts(emulator, endpoint, log, clock, StopFlag(), PERIOD_NS, ticks)
+        pacing = Lockstep(parts, delay_ns=SHORT.delay_ns, keeper=keeper)
+        try:
+            for tick in range(ticks):
+                pacing.exchange(tick * PERIOD_NS)
+        finally:
+            pacing.flush()
+    return Flown(pacing, emulator, link, [frame for _, frame in read_tlog(path)])
+
+
+def theirs(flown: Flown) -> list[bytes]:
+    """What the log holds of the controller's words."""
+    return [frame.raw for frame in flown.kept if (frame.system, frame.component) != (1, SHORT.wire.emulator_component)]
+
+
+class TestAnswers:
+    @pytest.fixture
+    def path(self, tmp_path: Path) -> Path:
+        return tmp_path / "run.tlog"
+
+    def test_each_tick_leaves_when_the_one_before_it_is_answered(self, path: Path) -> None:
+        flown = fly_script(path, 5, lambda writer, number: [command(writer, number)])
+        assert flown.link.sent_ns == [10**12 + k * MS for k in range(5)]
+        assert flown.pacing.latencies_ns == [MS] * 5
+        assert flown.pacing.all_counters() == {"resent": 0, "foreign": 0}
+
+    def test_with_a_speed_to_keep_a_tick_waits_for_its_time(self, path: Path) -> None:
+        flown = fly_script(path, 5, lambda writer, number: [command(writer, number)], speed=0.5)
+        assert flown.link.sent_ns == [10**12 + (k + 1) * 2 * PERIOD_NS for k in range(5)]
+        assert flown.pacing.all_counters() == {"resent": 0, "foreign": 0, "late": 0, "slipped": 0}
+
+    def test_a_late_copy_of_an_earlier_answer_is_foreign_and_not_logged(self, path: Path) -> None:
+        frames: list[bytes] = []
+
+        def script(writer: FrameWriter, number: int) -> list[bytes]:
+            frames.append(command(writer, number))
+            return [frames[number - 1], frames[number]] if number == 3 else [frames[number]]
+
+        flown = fly_script(path, 5, script)
+        assert flown.pacing.counters == {"resent": 0, "foreign": 1}
+        assert theirs(flown) == frames
+        assert flown.emulator.source.counters()["repeated"] == 1
+
+    def test_neither_is_what_came_with_it(self, path: Path) -> None:
+        def script(writer: FrameWriter, number: int) -> list[bytes]:
+            frame = command(writer, number)
+            return [frame] if number != 3 else [command(FrameWriter(*VEHICLE), 2) + beat(FrameWriter(7, 7)), frame]
+
+        flown = fly_script(path, 5, script)
+        assert flown.pacing.counters == {"resent": 0, "foreign": 2}
+        assert len(theirs(flown)) == 5
+
+    @pytest.mark.parametrize("stray", ["of a tick to come", "between ticks", "not a number"])
+    def test_a_stray_command_is_foreign_and_does_not_act(self, path: Path, stray: str) -> None:
+        def script(writer: FrameWriter, number: int) -> list[bytes]:
+            frame, other = command(writer, number), FrameWriter(*VEHICLE)
+            if number != 3:
+                return [frame]
+            if stray == "of a tick to come":
+                return [command(other, 4, -TAU), frame]
+            t_us = 3 * PERIOD_NS // 1000 + (stray == "between ticks")
+            controls = [float("nan") if stray == "not a number" else 1.0] * 6
+            payload = mapping.COMMAND.pack_fields(time_usec=t_us, controls=controls, mode=0xFF)
+            return [other.seal(mapping.COMMAND, payload), frame]
+
+        flown = fly_script(path, 5, script)
+        assert flown.pacing.counters == {"resent": 0, "foreign": 1}
+        assert len(theirs(flown)) == 5
+        clean = fly_script(path.with_name("clean.tlog"), 5, lambda writer, number: [command(writer, number)])
+        assert flown.emulator.plant.state.packed.tobytes() == clean.emulator.plant.state.packed.tobytes()
+
+    def test_frames_of_others_travel_into_the_log_with_the_answer(self, path: Path) -> None:
+        station = beat(FrameWriter(255, 190))
+
+        def script(writer: FrameWriter, number: int) -> list[bytes]:
+            frame = command(writer, number)
+            return [station, frame] if number == 3 else [frame]
+
+        flown = fly_script(path, 5, script)
+        assert flown.pacing.counters["foreign"] == 0
+        assert theirs(flown).index(station) == 3
+        assert [t_us for t_us, frame in read_tlog(path) if frame.raw == station] == [3 * PERIOD_NS // 1000]
+
+    def test_of_a_damaged_answer_and_its_copy_each_frame_is_logged_once(self, path: Path) -> None:
+        whole: list[bytes] = []
+
+        def script(writer: FrameWriter, number: int) -> list[bytes]:
+            if number < 3:
+                return [command(writer, number)]
+            if number == 3:
+                whole[:] = [beat(writer), command(writer, 3)]
+                damaged = bytearray(whole[1])
+                damaged[-1] ^= 1
+                return [whole[0] + bytes(damaged)]
+            return [b"".join(whole)] if number == 4 else [command(writer, number - 1)]
+
+        flown = fly_script(path, 5, script)
+        assert flown.pacing.counters == {"resent": 1, "foreign": 1}
+        assert theirs(flown)[3:5] == whole
+        assert len(theirs(flown)) == 6
+
+    def test_what_the_controller_said_before_its_first_answer_is_not_logged(self, path: Path) -> None:
+        hello, station = FrameWriter(*VEHICLE), beat(FrameWriter(255, 190))
+        hello.sequence = 41
+
+        def script(writer: FrameWriter, number: int) -> list[bytes]:
+            if number:
+                return [command(writer, number)]
+            return [beat(hello), beat(hello) + station, beat(writer) + command(writer, 0)]
+
+        flown = fly_script(path, 3, script)
+        ids = [(frame.system, frame.message_id) for frame in flown.kept if frame.component != 191]
+        beat_id, command_id = mapping.HEARTBEAT.message_id, mapping.COMMAND.message_id
+        assert ids == [(255, beat_id), (1, beat_id), (1, command_id), (1, command_id), (1, command_id)]
+        assert flown.pacing.counters["foreign"] == 2
+        numbers = [frame.sequence for frame in flown.kept if (frame.system, frame.component) == VEHICLE]
+        assert numbers == [0, 1, 2, 3]
+
+    def test_a_disarmed_answer_is_an_answer_and_acts_as_zeros(self, path: Path) -> None:
+        flown = fly_script(path, 5, lambda writer, number: [command(writer, number, armed=number < 2)])
+        assert flown.emulator.safety.counters["disarmed"] == 3
+        assert flown.emulator.plant.state.tau.tolist() == [0.0] * 6
+
+    def test_a_strangers_command_is_no_answer(self, path: Path) -> None:
+        stranger = FrameWriter(1, 2)
+
+        def script(writer: FrameWriter, number: int) -> list[bytes]:
+            return [command(stranger, number, -TAU), command(writer, number)]
+
+        flown = fly_script(path, 5, script)
+        assert flown.pacing.latencies_ns == [2 * MS] * 5
+        assert flown.emulator.source.newest == pytest.approx(TAU, rel=1e-6)
+
+
+class TestSilence:
+    def test_the_same_bytes_go_out_again_after_growing_waits_for_two_seconds(self, tmp_path: Path) -> None:
+        with pytest.raises(PeerLostError, match=r"gave no answer to the tick at t = 0\.008 s for 2 s") as caught:
+            fly_script(tmp_path / "run.tlog", 5, lambda writer, number: [command(writer, number)] if number < 2 else [])
+        assert "the script" in str(caught.value)
+
+    def test_an_answer_to_the_last_copy_goes_on_with_the_run(self, tmp_path: Path) -> None:
+        flown = fly_script(
+            tmp_path / "run.tlog",
+            2,
+            lambda writer, number: [command(writer, max(0, number - 7))] if number >= 7 else [],
+        )
+        waits_ms = (10, 20, 40, 80, 160, 320, 640)
+        assert flown.link.sent_ns[:8] == [10**12 + sum(waits_ms[:k]) * MS for k in range(8)]
+        assert len(set(flown.link.sent[:8])) == 1
+        assert flown.pacing.counters == {"resent": 7, "foreign": 0}
+        assert sum(RESEND_AFTER_S) == pytest.approx(2.0)
+        sent = [frame.sequence for frame in flown.kept if frame.component == SHORT.wire.emulator_component]
+        assert sent == list(range(len(sent))), "each tick is in the log once"
+
+    def test_a_stop_is_heard_while_it_waits(self, tmp_path: Path) -> None:
+        stop = StopFlag()
+
+        def silent(_number: int) -> list[bytes]:
+            stop.requested = True
+            return []
+
+        link = Scripted(clock := VirtualClock(), silent)
+        endpoint = Endpoint(link, 1, 191)
+        parts = Parts(Emulator(SHORT, endpoint, None), endpoint, None, clock, stop, PERIOD_NS, 5)
+        with pytest.raises(Interrupted):
+            Lockstep(parts, delay_ns=0, keeper=None).exchange(0)
+        assert len(link.sent) == 1
+
+    def test_what_keeps_coming_without_an_answer_does_not_hold_it_for_ever(self, tmp_path: Path) -> None:
+        """A flood of other frames: it looks at its time all the same."""
+
+        class Flooded(Scripted):
+            def recv(self, timeout_s: float) -> bytes | None:
+                self._clock.advance_ns(MS)
+                return beat(FrameWriter(255, 190))
+
+        link = Flooded(clock := VirtualClock(), lambda _number: [])
+        endpoint = Endpoint(link, 1, 191)
+        parts = Parts(Emulator(SHORT, endpoint, None), endpoint, None, clock, StopFlag(), PERIOD_NS, 5)
+        with pytest.raises(PeerLostError):
+            Lockstep(parts, delay_ns=0, keeper=None).exchange(0)
+        assert clock.now_ns() < 10_000 * MS

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bridge.endpoint import Endpoint
-from bridge.links.link import Link
+from bridge.links.memory import memory_pair
 from bridge.process import StopFlag
 from bridge.timing.clock import VirtualClock
 from plant_emulator.pacing.pacing import Parts
@@ -20,10 +20,12 @@ from plant_emulator.plant.truth import TruthWriter
 from plant_emulator.process import warm_up
 from plant_emulator.tick import Emulator
 from protocol.errors import PeerLostError
+from protocol.logs.tlog import TlogWriter, read_tlog
 from protocol.messages import VEHICLE, ActuatorCommand
 from protocol.wire import mapping
-from protocol.wire.codec import FrameWriter
+from protocol.wire.codec import FrameReader, FrameWriter
 from tests.loop import scenario_of
+from tests.plant_emulator.pacing.scripted import Scripted
 
 SCENARIO = scenario_of("flapper")
 PERIOD_NS = SCENARIO.period_ns
@@ -36,42 +38,6 @@ class Fly(Protocol):
     def __call__(
         self, ticks: int, answers: Callable[[FrameWriter, int], list[bytes]], *, waited_ns: int = 0
     ) -> Flown: ...
-
-
-class Scripted(Link):
-    """A link on a virtual clock: `answers` says what comes 1 ms, 2 ms ... after each tick; time passes while one waits."""
-
-    is_datagram = True
-    peer = "the script"
-
-    def __init__(self, clock: VirtualClock, answers: Callable[[int], list[bytes]]) -> None:
-        super().__init__("mem://script")
-        self._clock = clock
-        self._answers = answers
-        self._coming: list[tuple[int, bytes]] = []
-        self._tick = 0
-        self.sent: list[bytes] = []
-
-    def send(self, data: bytes | bytearray | memoryview) -> None:
-        if data[7] == mapping.TIMESYNC.message_id:
-            return  # the script has no clock to tell
-        self.sent.append(bytes(data))
-        now_ns = self._clock.now_ns()
-        for number, coming in enumerate(self._answers(self._tick), 1):
-            self._coming.append((now_ns + 1_000_000 * number, coming))
-        self._tick += 1
-
-    def recv(self, timeout_s: float) -> bytes | None:
-        until_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        if self._coming and self._coming[0][0] <= until_ns:
-            self.received_ns, data = self._coming.pop(0)
-            self._clock.sleep_until_ns(self.received_ns)
-            return data
-        self._clock.sleep_until_ns(until_ns)
-        return None
-
-    def close(self) -> None:
-        pass
 
 
 class Flown(NamedTuple):
@@ -206,3 +172,94 @@ def test_a_flood_does_not_stop_the_plant(tmp_path: Path) -> None:
         pacing.exchange(tick * PERIOD_NS)
     assert emulator.plant.t_ns == 5 * PERIOD_NS
     assert len(link.sent) == 5
+
+
+class TestRefusals:
+    """What does not count as an answer, nor as a sign of life."""
+
+    def test_a_control_that_is_no_number_is_refused_and_the_command_before_it_stands(self, fly: Fly) -> None:
+        def answers(writer: FrameWriter, tick: int) -> list[bytes]:
+            if tick != 3:
+                return [answer(writer, tick * PERIOD_NS)]
+            controls = [0.5, 0.5, float("nan"), 0.0, 0.0, 0.0]
+            payload = mapping.COMMAND.pack_fields(time_usec=tick * PERIOD_NS // 1000, controls=controls, mode=0xFF)
+            return [writer.seal(mapping.COMMAND, payload)]
+
+        flown = fly(4, answers)
+        assert flown.emulator.source.counters()["refused_commands"] == 1
+        assert flown.pacing.counters["unanswered"] == 1
+        assert flown.emulator.plant.state.tau == pytest.approx(np.array([0.5, 0.5, 0.0, 0.0, 0.0, 0.0]) * SCALE)
+
+    def test_a_strangers_command_does_not_act(self, fly: Fly) -> None:
+        stranger = FrameWriter(1, 2)
+        flown = fly(30, lambda _writer, tick: [answer(stranger, tick * PERIOD_NS)])
+        assert flown.pacing.counters["unanswered"] == 30
+        assert flown.emulator.safety.counters["stale"] == 1
+        assert flown.emulator.plant.state.tau == pytest.approx(np.array(SCENARIO.actuators.safe))
+
+    def test_a_disarmed_command_turns_the_motors_to_zero(self, fly: Fly) -> None:
+        def answers(writer: FrameWriter, tick: int) -> list[bytes]:
+            command = ActuatorCommand(tick * PERIOD_NS, SCALE, armed=tick < 3)
+            return [writer.seal(mapping.COMMAND, mapping.encode_command(command, SCALE, lockstep=False))]
+
+        flown = fly(5, answers)
+        assert flown.emulator.safety.counters["disarmed"] == 2
+        assert flown.emulator.plant.state.tau.tolist() == [0.0] * 6
+
+    def test_a_strangers_words_do_not_keep_a_silent_run_alive(self, fly: Fly) -> None:
+        stranger = FrameWriter(255, 190)
+        beat = mapping.encode_controller_heartbeat(armed=True)
+        with pytest.raises(PeerLostError, match="3 s without"):
+            fly(1000, lambda _writer, _tick: [stranger.seal(mapping.HEARTBEAT, beat)])
+
+    @pytest.mark.parametrize("spoken", ["heartbeat", "command"])
+    def test_the_controllers_words_do(self, fly: Fly, spoken: str) -> None:
+        def answers(writer: FrameWriter, tick: int) -> list[bytes]:
+            if tick % 250:  # one a second
+                return []
+            beat = writer.seal(mapping.HEARTBEAT, mapping.encode_controller_heartbeat(armed=True))
+            return [beat if spoken == "heartbeat" else answer(writer, tick * PERIOD_NS)]
+
+        assert fly(1500, answers).emulator.plant.t_ns == 1500 * PERIOD_NS
+
+    def test_the_time_is_told_to_the_controller_alone(self, fly: Fly) -> None:
+        question = mapping.encode_timesync(0, 77)
+        for sender, told in ((VEHICLE, 1), ((1, 2), 0)):
+            asker = FrameWriter(*sender)
+            flown = fly(
+                3,
+                lambda _writer, tick, asker=asker: [asker.seal(mapping.TIMESYNC, question)] if tick == 1 else [],  # type: ignore[misc]
+            )
+            reader = FrameReader(is_datagram=True)
+            times = [mapping.decode_timesync(one.payload) for raw in flown.link.questions for one in reader.read(raw)]
+            assert [asked_ns for answered_ns, asked_ns in times if answered_ns] == [77] * told
+
+
+class TestTimes:
+    def test_a_command_acts_at_the_moment_it_came_within_its_period(self, fly: Fly) -> None:
+        """1 ms after the tick it answers: until then, the command before it acts."""
+        flown = fly(2, lambda writer, tick: [answer(writer, tick * PERIOD_NS)] if tick == 0 else [])
+        plant = flown.emulator.plant
+        other = Emulator(SCENARIO, Endpoint(memory_pair()[0], 1, 191), None)
+        other.plant.command(1_000_000, flown.emulator.source.newest)
+        other.plant.advance(2 * PERIOD_NS)
+        assert plant.state.motion.tolist() == other.plant.state.motion.tolist()
+
+    def test_each_frame_both_ways_is_logged_once_in_its_order(self, tmp_path: Path) -> None:
+        warm_up(SCENARIO)
+        clock, writer = VirtualClock(10**12), FrameWriter(*VEHICLE)
+        link = Scripted(clock, lambda tick: [answer(writer, tick * PERIOD_NS)])
+        endpoint = Endpoint(link, 1, SCENARIO.wire.emulator_component)
+        with TlogWriter(tmp_path / "run.tlog") as log:
+            emulator = Emulator(SCENARIO, endpoint, None)
+            pacing = RealTime(Parts(emulator, endpoint, log, clock, StopFlag(), PERIOD_NS, 7))
+            for tick in range(7):
+                pacing.exchange(tick * PERIOD_NS)
+                pacing.flush()
+        kept = [frame for _, frame in read_tlog(tmp_path / "run.tlog")]
+        ids = [frame.message_id for frame in kept if frame.message_id != mapping.TIMESYNC.message_id]
+        exchange = [mapping.POSE.message_id, mapping.TICK.message_id, mapping.COMMAND.message_id]
+        assert ids[2:] == exchange * 7, "behind the first heartbeat and fix"
+        sent = b"".join(link.sent)
+        assert all(frame.raw in sent for frame in kept if frame.message_id == mapping.TICK.message_id)
+        assert len([frame for frame in kept if frame.message_id == mapping.TIMESYNC.message_id]) == len(link.questions)

@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
+import math
 import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common
 
+from bridge.endpoint import Endpoint
 from bridge.links.link import Link, open_link
 from bridge.links.memory import memory_pair
 from bridge.links.tcp import TcpIn
 from bridge.process import StopFlag
+from bridge.timing.clock import VirtualClock
 from plant_emulator.options import EmulatorOptions
 from plant_emulator.pacing import tolerant
+from plant_emulator.pacing.pacing import Parts
+from plant_emulator.pacing.tolerant import Tolerant
 from plant_emulator.plant.truth import load_truth
 from plant_emulator.process import fly, run_emulator, warm_up
+from plant_emulator.tick import Emulator
 from protocol.errors import LinkClosedError, PeerLostError, PeerMissingError, UsageError
-from protocol.logs.tlog import read_tlog
+from protocol.logs.tlog import TlogWriter, read_tlog
+from protocol.messages import VEHICLE, FloatArray
 from protocol.scenario import Scenario
 from protocol.wire import mapping
-from protocol.wire.codec import layout
+from protocol.wire.codec import FrameWriter, layout
+from tests.frames import command_frame
 from tests.loop import scenario_of
+from tests.plant_emulator.pacing.scripted import Scripted
 from tests.plant_emulator.pacing.test_lockstep import Faulty, lose_each
 
 HOVER = (0.0, 0.0, -0.0056 * 9.81 / 0.12, 0.0, 0.0, 0.0)
@@ -185,3 +195,136 @@ def test_it_is_of_lockstep_only() -> None:
     options = EmulatorOptions(link="mem://none", clock="realtime", profile="tolerant")
     with pytest.raises(UsageError, match="of lockstep"):
         run_emulator(flapper(250.0, 1.0), options, lambda _event: None, StopFlag())
+
+
+PERIOD_NS = 4_000_000
+MS = 1_000_000
+SCENARIO = flapper(250.0, 60.0)
+SCALE = np.array(SCENARIO.actuators.scale)
+TAU = np.array([0.25, -0.25, 0.5, 0.1, -0.1, 0.2]) * SCALE
+SAFE = np.array(SCENARIO.actuators.safe)
+
+
+class Flown(NamedTuple):
+    """Some ticks of the tolerant profile before a script."""
+
+    pacing: Tolerant
+    emulator: Emulator
+    link: Scripted
+    kept: list[tuple[int, bytes]]
+
+
+def command(writer: FrameWriter, tick: int, tau: FloatArray = TAU, *, armed: bool = True) -> bytes:
+    return command_frame(writer, tick * PERIOD_NS, tau, SCALE, armed=armed)
+
+
+def fly_script(
+    path: Path, ticks: int, script: Callable[[FrameWriter, int], list[bytes]], wait_s: float = 10.0
+) -> Flown:
+    """`script` says what comes 1 ms, 2 ms ... after the datagram of that number: a tick, or one sent again."""
+    warm_up(SCENARIO)
+    clock, writer = VirtualClock(10**12), FrameWriter(*VEHICLE)
+    link = Scripted(clock, lambda number: script(writer, number))
+    endpoint = Endpoint(link, 1, SCENARIO.wire.emulator_component)
+    emulator = Emulator(SCENARIO, endpoint, None)
+    with TlogWriter(path) as log:
+        parts = Parts(emulator, endpoint, log, clock, StopFlag(), PERIOD_NS, ticks)
+        pacing = Tolerant(parts, delay_ns=SCENARIO.delay_ns, keeper=None, wait_s=wait_s)
+        try:
+            for tick in range(ticks):
+                pacing.exchange(tick * PERIOD_NS)
+        finally:
+            pacing.flush()
+    kept = [(t_us, frame.raw) for t_us, frame in read_tlog(path) if frame.component == 1]
+    return Flown(pacing, emulator, link, kept)
+
+
+class TestScript:
+    """The same profile on a clock that moves only while one waits: each rule to the millisecond."""
+
+    @pytest.fixture
+    def path(self, tmp_path: Path) -> Path:
+        return tmp_path / "run.tlog"
+
+    def test_before_the_first_answer_ticks_go_out_a_period_apart_and_none_twice(self, path: Path) -> None:
+        flown = fly_script(path, 5, lambda _writer, _number: [])
+        assert flown.link.sent_ns == [10**12 + k * PERIOD_NS for k in range(5)]
+        assert flown.pacing.counters == {"resent": 0, "foreign": 0, "unanswered": 5, "late_answers": 0, "held": 5}
+        assert flown.emulator.plant.state.motion.tolist() == SCENARIO.initial_motion.tolist()
+
+    def test_after_it_one_is_waited_for_10_ms_then_sent_once_more_and_time_steps_on(self, path: Path) -> None:
+        flown = fly_script(path, 3, lambda writer, number: [command(writer, 0)] if number == 0 else [])
+        start_ns = 10**12 + MS
+        # The copy of a tick and the next tick leave together, when the wait is over.
+        assert flown.link.sent_ns == [10**12, *(start_ns + wait * MS for wait in (0, 10, 10, 20))]
+        assert flown.link.sent[1] == flown.link.sent[2]
+        assert flown.pacing.counters == {"resent": 2, "foreign": 0, "unanswered": 2, "late_answers": 0, "held": 0}
+        assert flown.emulator.plant.t_ns == 3 * PERIOD_NS
+
+    def test_a_late_answer_acts_when_it_comes_and_is_logged_then(self, path: Path) -> None:
+        late: list[bytes] = []
+
+        def script(writer: FrameWriter, number: int) -> list[bytes]:
+            if number == 1:  # the tick at 4 ms has no answer in time ...
+                late.append(command(writer, 1, 0.5 * TAU))
+                return []
+            return [late[0], command(writer, 2)] if number == 3 else [command(writer, number)] if not number else []
+
+        flown = fly_script(path, 3, script)
+        assert flown.pacing.counters == {"resent": 1, "foreign": 0, "unanswered": 1, "late_answers": 1, "held": 0}
+        assert [t_us for t_us, raw in flown.kept] == [0, 8000, 8000]
+
+    def test_an_answer_that_comes_again_is_no_answer_to_the_next_tick(self, path: Path) -> None:
+        first = command(FrameWriter(*VEHICLE), 0)
+        flown = fly_script(path, 4, lambda _writer, _number: [first])
+        assert flown.pacing.counters["unanswered"] == 3
+        assert flown.emulator.source.counters()["repeated"] > 0
+
+    @pytest.mark.parametrize("spoken", ["nothing", "the first answer again", "a stranger's answers", "not a number"])
+    def test_three_seconds_without_an_answer_end_the_run_whatever_else_is_said(self, path: Path, spoken: str) -> None:
+        stranger = FrameWriter(1, 2)
+
+        def script(writer: FrameWriter, number: int) -> list[bytes]:
+            if number == 0 or spoken == "the first answer again":
+                return [command(writer, 0)]
+            if spoken == "not a number":
+                bad = mapping.COMMAND.pack_fields(time_usec=number * PERIOD_NS // 1000, controls=[math.nan] * 6)
+                return [writer.seal(mapping.COMMAND, bad)]
+            return [command(stranger, number)] if spoken == "a stranger's answers" else []
+
+        with pytest.raises(PeerLostError, match=r"no HIL_ACTUATOR_CONTROLS for 3\.01 s of waiting, up to t = 1\.204 s"):
+            fly_script(path, 1000, script)
+
+    def test_the_first_answer_is_waited_for_as_long_as_one_chose(self, path: Path) -> None:
+        with pytest.raises(PeerLostError, match=r"for 0\.504 s of waiting, up to t = 0\.500 s"):
+            fly_script(path, 1000, lambda _writer, _number: [], wait_s=0.5)
+        path.unlink()
+        flown = fly_script(path, 125, lambda _writer, _number: [], wait_s=0.5)
+        assert flown.pacing.counters["unanswered"] == 125
+
+    def test_any_answer_begins_the_silence_anew(self, path: Path) -> None:
+        """Two silences of some 2 s each, with one late answer in between."""
+
+        def script(writer: FrameWriter, number: int) -> list[bytes]:
+            tick = {0: 0, 400: 200}.get(number)  # each tick from the second on is sent twice
+            return [] if tick is None else [command(writer, tick, np.zeros(6))]
+
+        flown = fly_script(path, 400, script)
+        assert (flown.pacing.counters["unanswered"], flown.pacing.counters["late_answers"]) == (399, 1)
+        assert flown.emulator.plant.t_ns == 400 * PERIOD_NS
+
+    def test_the_plant_is_held_until_the_first_armed_command_and_flies_from_there_on(self, path: Path) -> None:
+        flown = fly_script(path, 6, lambda writer, number: [command(writer, number, armed=number == 3)])
+        assert flown.pacing.counters["held"] == 3
+        assert flown.emulator.safety.counters["disarmed"] == 2, "those before it reach no motor"
+        assert flown.emulator.plant.state.motion.tolist() != SCENARIO.initial_motion.tolist()
+
+    def test_while_held_no_command_is_missed(self, path: Path) -> None:
+        flown = fly_script(path, 100, lambda writer, number: [command(writer, number, armed=False)])
+        assert flown.emulator.safety.counters == {"clamped": 0, "disarmed": 0, "stale": 0}
+        assert flown.pacing.counters["held"] == 100
+
+    def test_a_command_that_stands_too_long_ends_in_the_safe_output(self, path: Path) -> None:
+        flown = fly_script(path, 20, lambda writer, number: [command(writer, number)] if number == 0 else [])
+        assert flown.emulator.safety.counters["stale"] == 1
+        assert flown.emulator.plant.state.tau.tolist() == SAFE.tolist()
