@@ -10,10 +10,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.laws.law import Law, LawState, make_law
-from controller.laws.reference import reference_trajectory
+from controller.laws.law import (
+    Law,
+    LawState,
+    begin_sample,
+    coast,
+    law_advance,
+    law_output,
+    limit_on_the_wire,
+    make_law,
+)
+from controller.laws.reference import evaluate_reference, reference_trajectory
 from controller.laws.registry import LAWS
 from fwav_hil.simulate import simulate
+from protocol.compiled import Packed, compiled
 from protocol.messages import FloatArray
 from protocol.scenario import ZERO6, Noise, Scenario, find_scenario, load_scenario, replace_gains
 from tests.contracts.law_contract import WIDE, rotation_to_body
@@ -256,3 +266,60 @@ def test_without_limits_in_reach_the_two_observers_are_one() -> None:
     run, other = simulate(scenario), simulate(scenario, without_anti_windup(scenario))
     assert run.law_counts["saturated"] == 0
     assert other.q == pytest.approx(run.q, rel=0.0, abs=1e-6)
+
+
+@compiled
+def _step_in_parts(
+    law: Packed, state: Packed, t_ns: int, measured: FloatArray, velocity: FloatArray, share: float
+) -> None:
+    """The parts of `control_step` one by one; of what the wire carries, only `share` acts."""
+    data, s = law[0], state[0]
+    periods = begin_sample(data, data.period_ns, s, t_ns, measured)
+    if periods < 1:
+        return
+    gap_s = periods * data.period_ns * 1e-9 if periods > 1 else 0.0
+    if gap_s < data.memory_s.max():
+        for missing in range(1, periods):
+            then_s = (s.t_ns[0] + missing * data.period_ns) * 1e-9
+            evaluate_reference(then_s, data, s.desired[0], s.desired[1], s.desired[2])
+            coast(data, s, missing / periods, velocity)
+    evaluate_reference(t_ns * 1e-9, data, s.desired[0], s.desired[1], s.desired[2])
+    law_output(data, s, gap_s, velocity)
+    limit_on_the_wire(data, s, measured)
+    for axis in range(6):
+        s.applied[axis] *= share
+    law_advance(data, data.period_ns, s, t_ns, periods)
+
+
+class TestParts:
+    """The output of a law apart from its advance: other sinks put their own limits between the two."""
+
+    @pytest.mark.parametrize("name", BLIND_LAWS)
+    def test_one_by_one_they_give_the_bits_of_a_step(self, name: str) -> None:
+        law, q = make_law(name, FLAPPER), path(200, 7)
+        whole, parts, velocity = law.start(), law.start(), np.zeros(6)
+        t_ns = 0
+        for periods, measured in zip(np.random.default_rng(4).choice([0, 1, 1, 1, 1, 2, 5, 400], 200), q, strict=True):
+            t_ns += int(periods) * PERIOD_NS
+            law.step(whole, t_ns, measured)
+            _step_in_parts(law.packed, parts.packed, t_ns, measured, velocity, 1.0)
+            assert parts.packed.tobytes() == whole.packed.tobytes()
+        assert law.counts(whole)["missed_samples"] > 0
+        assert law.counts(whole)["steps"] < 200
+
+    @pytest.mark.parametrize("share", [0.0, 0.25, 0.9])
+    @pytest.mark.parametrize("name", ["ude", "dob"])
+    def test_with_another_limit_between_them_a_law_advances_with_what_really_acted(
+        self, name: str, share: float
+    ) -> None:
+        law, q = make_law(name, FLAPPER), path(21, 8)
+        state = fly_until(law, q, 20)
+        beside, x, t_ns = law.start(), state.x.copy(), 20 * PERIOD_NS
+        beside.packed[:] = state.packed
+        _step_in_parts(law.packed, state.packed, t_ns, q[20], np.zeros(6), share)
+        law.step(beside, t_ns, q[20])
+        assert state.tau.tobytes() == beside.tau.tobytes(), "what it asks for is the same"
+        assert state.applied.tolist() == (share * beside.applied).tolist()
+        expected = advanced(law, x, inputs(FLAPPER, t_ns, q[20]), share * beside.applied)
+        assert state.x == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
+        assert np.abs(state.x - beside.x).max() > 1e-6 * np.abs(expected).max(), "and that is another state"

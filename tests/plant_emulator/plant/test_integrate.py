@@ -224,6 +224,58 @@ def straight_gears(scenario: Scenario) -> object:
     return with_overrides(scenario, hysteresis=table).hysteresis
 
 
+class TestAllocation:
+    """What leaves the actuators (u) and the wrench on the body are two things: wrench = allocation u."""
+
+    @pytest.fixture
+    def matrix(self) -> FloatArray:
+        result: FloatArray = np.random.default_rng(5).normal(size=(6, 6))
+        return result
+
+    @pytest.fixture
+    def mixed(self, flapper: Scenario, matrix: FloatArray) -> Plant:
+        plant = Plant(replaced(flapper, initial=Initial(position=(0.0,) * 3, attitude=(0.0,) * 3)))
+        plant.parameters["allocation"][0] = matrix
+        return plant
+
+    def test_by_default_there_are_six_forces(self, flapper: Scenario) -> None:
+        plant = Plant(flapper)
+        assert plant.state.wrench.tolist() == plant.state.u.tolist()
+        plant.command(0, PUSH)
+        plant.apply_due_commands()
+        assert plant.state.wrench.tolist() == plant.state.u.tolist()
+
+    def test_the_gears_see_the_command_and_the_body_the_wrench(
+        self, flapper: Scenario, mixed: Plant, matrix: FloatArray
+    ) -> None:
+        gears = GearHysteresis(flapper.hysteresis, np.zeros(6))
+        mixed.command(0, PUSH)
+        mixed.command(0, PULL)
+        mixed.apply_due_commands()
+        gears.step(PUSH)
+        u = gears.step(PULL)
+        assert mixed.state.tau.tolist() == PULL.tolist()
+        assert mixed.state.u.tobytes() == u.tobytes()
+        assert mixed.state.wrench == pytest.approx(matrix @ u, rel=1e-12)
+
+    def test_the_body_moves_by_the_wrench(self, flapper: Scenario, mixed: Plant, matrix: FloatArray) -> None:
+        """A plant of six forces that is told to push with that wrench moves just so."""
+        mixed.command(0, 1e-3 * PUSH)
+        mixed.advance(MS)
+        plain = Plant(replaced(flapper, initial=Initial(position=(0.0,) * 3, attitude=(0.0,) * 3)))
+        plain.state.wrench[:] = matrix @ mixed.state.u
+        plain.advance(MS)
+        assert mixed.state.motion == pytest.approx(plain.state.motion, rel=1e-9, abs=1e-15)
+        assert plain.state.u.tolist() == [0.0] * 6
+
+    def test_the_accelerometer_feels_the_wrench(self, flapper: Scenario, mixed: Plant) -> None:
+        mixed.command(0, PUSH)
+        mixed.apply_due_commands()
+        expected = mixed.state.wrench[:3] / flapper.body.mass
+        assert mixed.specific_force() == pytest.approx(expected, rel=1e-12)
+        assert np.abs(expected - mixed.state.u[:3] / flapper.body.mass).max() > 1e-3
+
+
 def test_too_many_commands_on_their_way_are_an_error(flapper: Scenario) -> None:
     plant = Plant(flapper)
     for k in range(PENDING):
