@@ -33,7 +33,7 @@ def test_the_bytes_are_those_of_the_plain_writer_and_the_law(name: str, lockstep
     law = make_law(name, FLAPPER)
     sink, writer = HilSink(vehicle_writer(), lockstep=lockstep), vehicle_writer()
     ours, theirs = law.start(), law.start()
-    for t_ns, q in samples(100, gaps=True):
+    for t_ns, q in samples(40, gaps=True):
         tau = law.step(theirs, t_ns, q)
         expected = command_frame(writer, t_ns, tau, law.output.scale, lockstep=lockstep)
         assert sink.answer(law, ours, t_ns, q, armed=True) == expected
