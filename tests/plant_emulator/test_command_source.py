@@ -144,6 +144,15 @@ class TestWhoIsBelieved:
         assert end.hear(strange + command(writer, 0) + strange) == ["command", 0, "command"]
         assert end.source.newest.tolist() == as_the_wire_has_it(TAU).tolist()
 
+    def test_the_sender_is_the_one_it_is_told_of(self) -> None:
+        near, far = memory_pair()
+        source = CommandSource(Endpoint(far, *EMULATOR).reader, (7, 9), SCALE, PERIOD_NS)
+        for sender in ((7, 7), (9, 9), (9, 7), (7, 9)):
+            near.send(command(FrameWriter(*sender), 0))
+            source.feed(far.recv(0.0) or b"")
+            assert (source.read() is Found.COMMAND) == (sender == (7, 9))
+        assert source.newest_ns == 0, "and before it is told of any, the first tick may be answered"
+
 
 class TestNumbers:
     @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -235,9 +244,10 @@ class TestSequence:
         assert end.counted() == {}
 
     def test_later_commands_restart_no_numbers(self, end: End, writer: FrameWriter) -> None:
+        station = FrameWriter(255, 190)
         for k in range(4):
-            end.hear(command(writer, k * PERIOD_NS))
-            beat(writer)
+            end.hear(command(writer, k * PERIOD_NS), beat(station))
+            beat(station)
         assert end.counted() == {"sequence_gaps": 3}
 
     def test_a_command_that_comes_late_is_counted(self, end: End, writer: FrameWriter) -> None:

@@ -179,11 +179,12 @@ class TestPoses:
         assert end.hear(pose(writer, pose_ns) + tick(writer, 4 * MS)) == []
         assert end.counted() == {"tick_without_pose": 1}
 
-    def test_a_tick_whose_pose_was_lost_is_no_sample(self, end: End, writer: FrameWriter) -> None:
-        assert end.hear(tick(writer, 0)) == []
+    @pytest.mark.parametrize("t_ns", [0, 1000, 4 * MS])
+    def test_a_tick_whose_pose_was_lost_is_no_sample(self, end: End, writer: FrameWriter, t_ns: int) -> None:
+        assert end.hear(tick(writer, t_ns)) == []
         assert end.counted() == {"tick_without_pose": 1}
-        assert end.hear(tick_frames(writer, 0, Q)) == [0], "sent again, whole, it is one"
-        assert end.hear(tick(writer, 4 * MS)) == [], "the pose before it is not used twice"
+        assert end.hear(tick_frames(writer, t_ns, Q)) == [t_ns], "sent again, whole, it is one"
+        assert end.hear(tick(writer, t_ns + 4 * MS)) == [], "the pose before it is not used twice"
         assert end.counted() == {"tick_without_pose": 2}
 
     def test_a_tick_whose_pose_was_damaged_is_no_sample(self, end: End, writer: FrameWriter) -> None:
@@ -257,9 +258,11 @@ class TestSequence:
 
     def test_later_samples_restart_no_numbers(self, end: End, writer: FrameWriter) -> None:
         end.hear(tick_frames(writer, 0, Q))
+        station = FrameWriter(255, 190)
+        end.hear(beat(station))
         for k in range(1, 4):
-            beat(writer)
-            end.hear(tick_frames(writer, k * 4 * MS, Q))
+            beat(station)
+            end.hear(tick_frames(writer, k * 4 * MS, Q), beat(station))
         assert end.counted() == {"sequence_gaps": 3}
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -151,3 +153,88 @@ def test_anything_else_is_none(content: bytes, tmp_path: Path) -> None:
 def test_nor_is_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="cannot read the signing key"):
         read_key(tmp_path / "key")
+
+
+class TestWhatIsBelieved:
+    """Each way in which a signature is none, or an old one, by itself."""
+
+    @pytest.mark.parametrize("spoil", [lambda raw: raw[:-1], lambda raw: raw + b"\0", lambda raw: raw[:-13]])
+    def test_a_signature_of_another_length_is_none(self, spoil: Callable[[bytes], bytes]) -> None:
+        assert Signatures(KEY).verify(spoil(Signatures(KEY).sign(PLAIN, NOW_US)), NOW_US) is Verdict.MISSING
+
+    def test_without_the_flag_there_is_none_whatever_follows(self) -> None:
+        signed = Signatures(KEY).sign(PLAIN, NOW_US)
+        assert Signatures(KEY).verify(PLAIN + signed[-13:], NOW_US) is Verdict.MISSING
+
+    def test_mavlink_1_has_none(self) -> None:
+        old = bytes(common.MAVLink_heartbeat_message(0, 8, 0, 0, 4, 3).pack(common.MAVLink(None), force_mavlink1=True))
+        assert Signatures(KEY).verify(old, NOW_US) is Verdict.MISSING
+        assert Signatures(KEY).verify(b"\xfe" + Signatures(KEY).sign(PLAIN, NOW_US)[1:], NOW_US) is Verdict.MISSING
+
+    @pytest.mark.parametrize("at", [3, 4, 5, 6, 9, 10, 18, -14, -13, -12, -7, -6, -1])
+    def test_every_byte_is_signed(self, at: int) -> None:
+        changed = bytearray(Signatures(KEY).sign(PLAIN, NOW_US))
+        changed[at] ^= 1
+        assert Signatures(KEY).verify(bytes(changed), NOW_US) is Verdict.BAD
+
+    @pytest.mark.parametrize("sender", [(2, 191), (1, 190), (191, 1)])
+    def test_each_sender_has_a_time_of_its_own(self, sender: tuple[int, int]) -> None:
+        other = FrameWriter(*sender).seal(mapping.HEARTBEAT, mapping.encode_emulator_heartbeat())
+        judge = Signatures(KEY)
+        assert judge.verify(Signatures(KEY).sign(PLAIN, NOW_US + 5_000_000), NOW_US) is Verdict.GOOD
+        assert judge.verify(Signatures(KEY).sign(other, NOW_US), NOW_US) is Verdict.GOOD
+        assert judge.verify(Signatures(KEY).sign(PLAIN, NOW_US), NOW_US) is Verdict.OLD
+
+    def test_so_has_each_link(self) -> None:
+        judge = Signatures(KEY)
+        assert judge.verify(Signatures(KEY, 1).sign(PLAIN, NOW_US), NOW_US) is Verdict.GOOD
+        assert judge.verify(Signatures(KEY, 2).sign(PLAIN, NOW_US), NOW_US) is Verdict.GOOD
+        assert judge.verify(Signatures(KEY, 1).sign(PLAIN, NOW_US), NOW_US) is Verdict.OLD
+
+    @pytest.mark.parametrize(("later_us", "verdict"), [(-10, Verdict.OLD), (0, Verdict.OLD), (10, Verdict.GOOD)])
+    def test_a_tick_of_10_us_is_enough(self, later_us: int, verdict: Verdict) -> None:
+        judge = Signatures(KEY)
+        judge.verify(Signatures(KEY).sign(PLAIN, NOW_US), NOW_US)
+        assert judge.verify(Signatures(KEY).sign(PLAIN, NOW_US + later_us), NOW_US) is verdict
+
+    @pytest.mark.parametrize(("behind_us", "verdict"), [(59_999_990, Verdict.GOOD), (60_000_000, Verdict.OLD)])
+    def test_the_first_is_younger_than_a_minute(self, behind_us: int, verdict: Verdict) -> None:
+        assert Signatures(KEY).verify(Signatures(KEY).sign(PLAIN, NOW_US - behind_us), NOW_US) is verdict
+
+    def test_what_is_not_believed_does_not_move_the_time(self) -> None:
+        judge = Signatures(KEY)
+        far = bytearray(Signatures(KEY).sign(PLAIN, NOW_US + 10**12))
+        far[-1] ^= 1
+        assert judge.verify(bytes(far), NOW_US) is Verdict.BAD
+        assert judge.verify(Signatures(KEY).sign(PLAIN, NOW_US), NOW_US) is Verdict.GOOD
+
+
+class TestWhatIsSigned:
+    def test_a_signature_is_the_link_the_time_and_the_digest(self) -> None:
+        signed = Signatures(KEY, 5).sign(PLAIN, NOW_US)
+        stamp = bytes([5]) + ((NOW_US - 1_420_070_400_000_000) // 10).to_bytes(6, "little")
+        assert signed[-13:-6] == stamp
+        assert signed[-6:] == hashlib.sha256(KEY + signed[:-6]).digest()[:6]
+
+    def test_other_flags_stay_as_they_are(self) -> None:
+        odd = PLAIN[:2] + b"\x02" + PLAIN[3:]
+        signed = Signatures(KEY).sign(odd, NOW_US)
+        assert signed[2] == 0x03
+        stripped = strip(signed)
+        assert stripped is not None
+        assert stripped[:-2] == odd[:-2]
+
+    def test_what_is_not_known_cannot_be_stripped(self) -> None:
+        assert strip(b"\xfd\x01\x01\x00\x09\x01\x01\xff\xff\xfe\x07\x11\x22" + bytes(13)) is None
+
+    def test_messages_of_another_dialect_can_be_signed(self) -> None:
+        signer = Signatures(KEY, messages={0: layout("HEARTBEAT")})
+        assert len(signer.sign(PLAIN, NOW_US)) == len(PLAIN) + 13
+        assert signer.sign(attitude(), NOW_US) == attitude()
+        assert (signer.signed, signer.unsigned) == (1, 1)
+
+    def test_before_its_first_the_clock_may_say_anything(self) -> None:
+        """A machine that has just started may be in 1970."""
+        signer = Signatures(KEY)
+        assert signer.sign(PLAIN, 0)[-12:-6] == (1).to_bytes(6, "little")
+        assert signer.sign(PLAIN, 0)[-12:-6] == (2).to_bytes(6, "little")
