@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 
 from bridge.endpoint import Endpoint
-from bridge.links.link import Link, open_link
+from bridge.links.link import open_link
 from bridge.process import StopFlag, end_with_parent
 from bridge.timing.clock import MonotonicClock
 from bridge.timing.timesync import TimeSync
@@ -19,10 +19,9 @@ from protocol.wire import mapping
 _LOOK_S = 0.1
 
 
-def respond(link: Link, stop: StopFlag) -> None:
+def respond(endpoint: Endpoint, stop: StopFlag) -> None:
     """Answer every TIMESYNC question until a stop is requested."""
     clock = MonotonicClock()
-    endpoint = Endpoint(link, *VEHICLE)
     time_sync = TimeSync(endpoint.seal, clock)
     while not stop.requested:
         for frame in endpoint.receive(_LOOK_S):
@@ -39,9 +38,10 @@ def main(uri: str) -> int:
     stop.install()
     try:
         with open_link(uri) as link:
+            endpoint = Endpoint(link, *VEHICLE)
             sys.stdout.write(link.uri + "\n")
             sys.stdout.flush()
-            respond(link, stop)
+            respond(endpoint, stop)
     except FwavHilError as error:
         sys.stderr.write(f"responder: {error}\n")
         return error.exit_code

@@ -127,6 +127,7 @@ class FrameWriter:
         self.component = component
         self.sequence = 0
         self._out = np.zeros(LONGEST_FRAME, dtype=np.uint8)
+        framing.seal_frame(self._out, 0, b"", 0, 0, system, component, 0, 0)  # compiled now, not with the first frame
 
     def seal(self, message: Layout, payload: bytes) -> bytes:
         """One frame: trailing zeros of the payload cut off (one byte stays), header, checksum."""
@@ -181,6 +182,7 @@ class FrameReader:
         self._is_datagram = is_datagram
         self._rest = b""
         self._counted, self._next = self.reading["counters"][0], self.reading["next"][0]
+        framing.read_frames(b"", 0, self.reading, self.table, self.rows)  # compiled now, not with the first frame
 
     @property
     def counters(self) -> dict[str, int]:

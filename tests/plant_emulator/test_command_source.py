@@ -16,6 +16,7 @@ from protocol.messages import VEHICLE, FloatArray
 from protocol.wire import mapping
 from protocol.wire.codec import FrameWriter
 from tests.frames import EMULATOR, command_frame, vehicle_writer
+from tests.streams import AsStream
 
 PERIOD_NS = 4_000_000
 PERIOD_US = PERIOD_NS // 1000
@@ -30,8 +31,8 @@ class End:
     """The emulator's receiving end of a link, read as `plant_emulator.pacing` reads it."""
 
     def __init__(self, *, is_datagram: bool = True, oldest_ns: int = 0, latest_ns: int = FAR_NS) -> None:
-        self.near, self._far = memory_pair()
-        self._far.is_datagram = is_datagram
+        self.near, far = memory_pair()
+        self._far = far if is_datagram else AsStream(far)
         self._endpoint = Endpoint(self._far, *EMULATOR)
         self.source = CommandSource(self._endpoint.reader, VEHICLE, SCALE, PERIOD_NS)
         self.source.expect(oldest_ns, latest_ns)

@@ -32,7 +32,7 @@ def test_it_answers_questions_and_nothing_else_until_it_is_stopped() -> None:
     stop = StopFlag()
     station = Endpoint(near, *STATION)
     with near, far, ThreadPoolExecutor(1) as threads:
-        service = threads.submit(respond, far, stop)
+        service = threads.submit(respond, Endpoint(far, 1, 1), stop)
         try:
             near.send(b"\xfd no frame")
             station.send([station.seal(mapping.HEARTBEAT, mapping.encode_emulator_heartbeat())])

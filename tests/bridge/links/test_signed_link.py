@@ -21,6 +21,7 @@ from protocol.wire.codec import FrameReader, FrameWriter
 from protocol.wire.signing import Signatures
 from tests.loop import fly_both, scenario_of
 from tests.plant_emulator.pacing.test_lockstep import Faulty
+from tests.streams import AsStream
 
 KEY, OTHER = bytes(range(32)), bytes(32)
 BEAT = FrameWriter(1, 191).seal(mapping.HEARTBEAT, mapping.encode_emulator_heartbeat())
@@ -115,8 +116,8 @@ class TestRefusals:
     @pytest.mark.parametrize("is_datagram", [True, False])
     @pytest.mark.parametrize("cause", ["unsigned", "bad_signature", "old_signature", "unsealed"])
     def test_only_the_frame_in_question_is_dropped(self, cause: str, is_datagram: bool) -> None:
-        near, far = memory_pair()
-        far.is_datagram = is_datagram
+        near, end = memory_pair()
+        far = end if is_datagram else AsStream(end)
         now_us, signer = unix_time_us(), Signatures(KEY)
         unknown = b"\xfd\x01\x01\x00\x09\x01\x01\xff\xff\xfe\x07\x11\x22"
         refused = {
@@ -150,8 +151,7 @@ class TestRefusals:
 
     def test_a_frame_cut_in_two_by_a_stream_is_believed_when_it_is_whole(self) -> None:
         near, far = memory_pair()
-        far.is_datagram = False
-        link = SignedLink(far, KEY)
+        link = SignedLink(AsStream(far), KEY)
         signed = Signatures(KEY).sign(BEAT, unix_time_us())
         near.send(signed[:20])
         assert link.recv(0.0) is None
@@ -217,9 +217,8 @@ class TestPlace:
 
     def test_a_stream_has_its_peer_by_its_connection(self, ends: tuple[MemoryLink, Held, SignedLink]) -> None:
         near, held, _ = ends
-        held.is_datagram = False
         near.send(BEAT)
-        assert SignedLink(held, KEY).recv(0.0) is None
+        assert SignedLink(AsStream(held), KEY).recv(0.0) is None
         assert held.released == 0
 
     def test_what_is_received_keeps_the_stamp_of_its_link(self, ends: tuple[MemoryLink, Held, SignedLink]) -> None:
@@ -241,7 +240,8 @@ class TestPlace:
 def with_flags(raw: bytes, flags: int) -> bytes:
     """A frame with other incompatibility flags, its checksum made to fit."""
     body = raw[1:2] + bytes([flags]) + raw[3:-2]
-    return b"\xfd" + body + common.x25crc(body + bytes([mapping.HEARTBEAT.crc_seed])).crc.to_bytes(2, "little")
+    checksum: int = common.x25crc(body + bytes([mapping.HEARTBEAT.crc_seed])).crc
+    return b"\xfd" + body + checksum.to_bytes(2, "little")
 
 
 def signature_of(raw: bytes, now_us: int) -> bytes:

@@ -17,6 +17,7 @@ from protocol.messages import VEHICLE, FloatArray
 from protocol.wire import mapping
 from protocol.wire.codec import FrameWriter, layout
 from tests.frames import EMULATOR, NO_READINGS, emulator_writer, tick_frames
+from tests.streams import AsStream
 
 MS = 1_000_000
 Q = np.array([0.25, -0.5, 1.5, 0.1, -0.2, 0.3])
@@ -29,8 +30,8 @@ class End:
     """The controller's receiving end of a link, heard as `controller.tick` hears it."""
 
     def __init__(self, *, is_datagram: bool = True) -> None:
-        self.near, self._far = memory_pair()
-        self._far.is_datagram = is_datagram
+        self.near, far = memory_pair()
+        self._far = far if is_datagram else AsStream(far)
         self._endpoint = Endpoint(self._far, *VEHICLE)
         self.source = HilSource(self._endpoint.reader, EMULATOR)
 

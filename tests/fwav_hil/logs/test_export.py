@@ -165,4 +165,4 @@ class TestOutputs:
         monkeypatch.setattr("fwav_hil.logs.choice.open_log", lambda path, progress: open_log(path))
         ended = shell("export", flight_log, "--to", kind, "--out", "out")
         assert (ended.code, ended.err.strip()) == (130, "fwav-hil: interrupted")
-        assert {path.name for path in tmp_path.iterdir()} == {"flight.tlog", "warm-logs"}
+        assert {path.name for path in tmp_path.iterdir()} == {"flight.tlog"}
