@@ -82,6 +82,7 @@ class CommandSource:
     newest_ns   time of the tick that it answers; negative before the first     armed   whether it may act at all
     is_read     whether all that was fed has been read
     others      frames that are no commands, since they were last taken: somebody else hears them
+    memory      what the kernels share of it: its fields newest (6,) and armed
     raws        every intact frame since they were last taken, as it was on the wire: for the log
 
     counters    refused_commands  commands with a control that is not a number
@@ -97,7 +98,7 @@ class CommandSource:
         self._sender = sender
         self._reader = reader
         self._rows = np.zeros(_FRAMES_AT_ONCE, dtype=reader.rows.dtype)
-        self._memory = pack(
+        self.memory = pack(
             {
                 "system": sender[0],
                 "component": sender[1],
@@ -111,12 +112,12 @@ class CommandSource:
             },
             {"command": COMMAND.dtype},
         )
-        self._arguments = (reader.reading, reader.table, self._rows, self._memory)
+        self._arguments = (reader.reading, reader.table, self._rows, self.memory)
         self._oldest_us = self._latest_us = 0
         self._offsets = self._rows["offset"]
         self._data = b""
         self._at = 0
-        self.newest: FloatArray = self._memory["newest"][0]
+        self.newest: FloatArray = self.memory["newest"][0]
 
     def expect(self, oldest_ns: int, latest_ns: int) -> None:
         """From now on a command may answer the ticks from oldest_ns to latest_ns, if it is newer than the newest."""
@@ -150,8 +151,8 @@ class CommandSource:
     @property
     def strays(self) -> int:
         """How many commands were refused, whatever the cause."""
-        return int(self._memory["counters"][0].sum())
+        return int(self.memory["counters"][0].sum())
 
     def counters(self) -> dict[str, int]:
         """What was refused, by cause."""
-        return dict(zip(CAUSES, self._memory["counters"][0].tolist(), strict=True))
+        return dict(zip(CAUSES, self.memory["counters"][0].tolist(), strict=True))

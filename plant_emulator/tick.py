@@ -14,7 +14,15 @@ from bridge.endpoint import Endpoint
 from bridge.requests import Requests
 from bridge.station import Station
 from plant_emulator.command_source import CommandSource
-from plant_emulator.plant.integrate import Plant, PlantState, push_command, specific_force
+from plant_emulator.plant.integrate import (
+    GOES_ON,
+    TOO_MANY_PENDING,
+    Plant,
+    PlantState,
+    push_command,
+    record_and_advance,
+    specific_force,
+)
 from plant_emulator.plant.rigid_body import body_rates
 from plant_emulator.plant.safety import SafetyEnvelope, pass_command
 from plant_emulator.plant.sensors import NOISE_BLOCK, InertialSensors, PositionSensor, add_noise, inertial_readings
@@ -35,6 +43,7 @@ if TYPE_CHECKING:  # what a run without a CAN bus need not load
     from bridge.motor_bus.drives import CanMotors
 
 TRUTH = (STATE, ODOMETRY)
+ACT, MOVE, MEASURE = 1, 2, 4
 
 
 @compiled
@@ -45,21 +54,29 @@ def act(envelope: Any, state: PlantState, t_ns: int, acts_ns: int, tau: FloatArr
 
 
 @compiled
-def _act_packed(envelope: Packed, state: Packed, t_ns: int, acts_ns: int, tau: FloatArray, armed: bool) -> bool:
-    return act(envelope[0], state[0], t_ns, acts_ns, tau, armed)
+def _steps(
+    state: Packed, parameters: Packed, envelope: Packed, source: Packed, memory: Packed, steps: int, at: int,
+    t_ns: int, end_ns: int, arrival_ns: int, acts_ns: int, sequence: int, system: int, component: int,
+) -> tuple[int, int, int]:  # fmt: skip
+    """Those `steps` of a tick that are wanted, in their one order: (outcome, where the frames of the next tick end).
 
-
-@compiled
-def _measure_and_seal(
-    state: Packed, parameters: Packed, sensors: Packed, t_ns: int, sequence: int, system: int, component: int
-) -> tuple[int, int]:
-    """Measure the plant at t_ns and write both frames of the tick into `sensors.out`; returns where each ends."""
-    s, body, motion = sensors[0], parameters[0], state[0].motion
-    add_noise(motion, s.noise[s.at], s.position, s.attitude, s.q)
-    s.at += 1
-    specific_force(t_ns * 1e-9, state[0].wrench, body, s.force)
-    inertial_readings(motion, s.force, s.field, s.sea_level, s.readings)
-    return write_tick(s, t_ns // 1000, s.q, s.readings, sequence, system, component)
+    ACT lets the newest command act, MOVE notes the row of t_ns and moves the plant to end_ns, MEASURE measures it there, with
+    the noise in row `at`, and seals pose and tick into `memory.out`.
+    """
+    s, p, m, newest = state[0], parameters[0], memory[0], source[0].newest
+    if steps & ACT and not act(envelope[0], s, arrival_ns, acts_ns, newest, source[0].armed != 0):
+        return TOO_MANY_PENDING, 0, 0
+    if steps & MOVE:
+        outcome = record_and_advance(s, p, t_ns, end_ns, newest, m.row)
+        if outcome != GOES_ON:
+            return outcome, 0, 0
+    middle = end = 0
+    if steps & MEASURE:
+        add_noise(s.motion, m.noise[at], m.position, m.attitude, m.q)
+        specific_force(end_ns * 1e-9, s.wrench, p, m.force)
+        inertial_readings(s.motion, m.force, m.field, m.sea_level, m.readings)
+        middle, end = write_tick(m, end_ns // 1000, m.q, m.readings, sequence, system, component)
+    return GOES_ON, middle, end
 
 
 class Emulator:
@@ -95,27 +112,35 @@ class Emulator:
         self._truth = truth
         self._inertial = InertialSensors(scenario.world)
         self._position = PositionSensor(scenario.seed)
-        self._row = np.zeros(31)
         readings = np.zeros(13)
         readings[12] = scenario.world.temperature_celsius
-        self._sensors = pack(
+        self._memory = pack(
             {
                 "position": scenario.noise.position,
                 "attitude": scenario.noise.attitude,
                 "noise": np.zeros((NOISE_BLOCK, 6)),
-                "at": NOISE_BLOCK,
                 "q": np.zeros(6),
                 "force": np.zeros(3),
                 "field": np.array(scenario.world.magnetic_field_ned),
                 "sea_level": scenario.world.altitude,
                 "readings": readings,
+                "row": np.zeros(31),
                 "out": np.zeros(2 * LONGEST_FRAME, dtype=np.uint8),
             },
             {"pose": mapping.POSE.dtype, "tick": mapping.TICK.dtype},
         )
-        self._left_in_block = 0
-        self._out: Output = self._sensors["out"][0]
-        self._packed = (self.plant.state.packed, self.plant.parameters, self._sensors)
+        self._at = NOISE_BLOCK
+        self._row: FloatArray = self._memory["row"][0]
+        self._out: Output = self._memory["out"][0]
+        plant, envelope = self.plant, self.safety.packed
+        self._packed = (plant.state.packed, plant.parameters, envelope, self.source.memory, self._memory)
+        self._waits = 0
+        """ACT, where the newest command is to act before anything else happens to the plant."""
+        self._arrival_ns = self._acts_ns = 0
+        self._measured_ns, self._sequence, self._middle, self._end = -1, 0, 0, 0
+        """Of the tick that is measured but not yet sent (-1: none): time, first sequence number, where its frames end."""
+        self._due: list[bytes] = []
+        self._sealed = b""
 
     def say_truth(self, rate_hz: float) -> None:
         """Have the true state said on the loop's link from now on, as if its peer had asked for that."""
@@ -132,35 +157,58 @@ class Emulator:
         self.station.answer()
         return self.schedule.answers()
 
-    def sense(self, t_ns: int) -> list[bytes]:
-        """The frames of the tick at t_ns, in the order in which they travel: those that are due, the pose, the tick."""
+    def sense(self, t_ns: int) -> bytes:
+        """The tick at t_ns as one datagram: the frames that are due, the pose, the tick; `frames` has them one by one."""
         writer = self._endpoint.writer
-        frames: list[bytes] = []
+        due: list[bytes] = []
         if t_ns >= self.schedule.next_ns:
-            frames = [writer.seal(*saying) for saying in self.schedule.due(t_ns)]
+            due = [writer.seal(*saying) for saying in self.schedule.due(t_ns)]
         if t_ns >= self.station.next_ns:
             self.station.poll(t_ns)
-        if not self._left_in_block:
-            self._sensors["noise"][0], self._sensors["at"][0] = self._position.draw(NOISE_BLOCK), 0
-            self._left_in_block = NOISE_BLOCK
-        self._left_in_block -= 1
-        middle, end = _measure_and_seal(*self._packed, t_ns, writer.sequence, writer.system, writer.component)
+        if self._measured_ns != t_ns or self._sequence != writer.sequence:
+            self._run(MEASURE, t_ns)
+        self._at += 1
+        self._measured_ns = -1
         writer.sequence = (writer.sequence + 2) & 0xFF
-        sealed = self._out[:end].tobytes()
-        frames += (sealed[:middle], sealed[middle:])
-        return frames
+        self._due, self._sealed = due, self._out[: self._end].tobytes()
+        return b"".join((*due, self._sealed)) if due else self._sealed
+
+    def frames(self) -> list[bytes]:
+        """The frames of the tick that `sense` gave last, in their order."""
+        return [*self._due, self._sealed[: self._middle], self._sealed[self._middle :]]
 
     def act(self, arrival_ns: int, delay_ns: int) -> None:
         """Let the newest command, which came at simulation time arrival_ns, act delay_ns later, within the envelope.
 
-        Raises DivergenceError where too many commands are on their way.
+        It waits for `advance`; where another command may come before that, `settle` follows. Raises DivergenceError, now or
+        then, where too many commands are on their way.
         """
-        newest, armed = self.source.newest, self.source.armed
-        acts_ns = arrival_ns + delay_ns
         if self.motors:
-            self._drive(arrival_ns, acts_ns, self.safety.pass_command(arrival_ns, newest, armed=armed))
-        elif not _act_packed(self.safety.packed, self._packed[0], arrival_ns, acts_ns, newest, armed):
-            self.plant.refuse_more()
+            allowed = self.safety.pass_command(arrival_ns, self.source.newest, armed=self.source.armed)
+            self._drive(arrival_ns, arrival_ns + delay_ns, allowed)
+        else:
+            self._arrival_ns, self._acts_ns = arrival_ns, arrival_ns + delay_ns
+            self._waits = ACT
+
+    def settle(self) -> None:
+        """Let the newest command act now: another one may be read, or the staleness of commands be looked into."""
+        if self._waits:
+            self._run(0, self.plant.t_ns)
+
+    def _run(self, steps: int, end_ns: int) -> None:
+        """Have the kernel do what waits, then these steps. Raises DivergenceError."""
+        writer, waits = self._endpoint.writer, self._waits
+        if self._at == NOISE_BLOCK and steps & MEASURE:
+            self._memory["noise"][0], self._at = self._position.draw(NOISE_BLOCK), 0
+        self._waits = 0
+        self._sequence = sequence = writer.sequence
+        outcome, self._middle, self._end = _steps(
+            *self._packed, waits | steps, self._at, self.plant.t_ns, end_ns, self._arrival_ns, self._acts_ns, sequence,
+            writer.system, writer.component,
+        )  # fmt: skip
+        self._measured_ns = end_ns if steps & MEASURE else -1
+        if steps & MOVE or outcome != GOES_ON:
+            self.plant.arrive(end_ns, outcome)
 
     def _drive(self, t_ns: int, acts_ns: int, tau: FloatArray) -> None:
         """Let tau (6,), asked for at t_ns, act from acts_ns on."""
@@ -171,6 +219,7 @@ class Emulator:
 
     def check_staleness(self, t_ns: int, delay_ns: int = 0) -> None:
         """Turn to the safe output, as late as any command acts, where none has come for too long."""
+        self.settle()
         stale = self.safety.stale_output(t_ns)
         if stale is not None:
             expired_ns, output = stale
@@ -178,17 +227,21 @@ class Emulator:
             self._drive(acts_ns, acts_ns, output)
 
     def advance(self, end_ns: int) -> None:
-        """Note the tick's row and integrate to the next one; `record` follows. Raises DivergenceError, the row recorded."""
+        """Note the tick's row and integrate to the next one, which is measured too where nothing else is due with it.
+
+        `record` follows. Raises DivergenceError, the row being recorded.
+        """
         t_ns = self.plant.t_ns
+        alone = end_ns < self.schedule.next_ns and end_ns < self.station.next_ns
         try:
-            self.plant.record_and_advance(end_ns, self.source.newest, self._row)
+            self._run(MOVE | MEASURE if alone else MOVE, end_ns)
         except DivergenceError:
             self.record(t_ns)
             raise
 
     def hold(self, end_ns: int) -> None:
         """Note the tick's row and let time pass with the plant where it is."""
-        self.plant.record_and_advance(self.plant.t_ns, self.source.newest, self._row)
+        self._run(MOVE, self.plant.t_ns)
         self.plant.t_ns = end_ns
 
     def record(self, t_ns: int) -> None:

@@ -42,7 +42,7 @@ def replay_in_process(run: Recorded) -> Difference:
         sent: dict[int, bytes] = {}
         for number, tick in enumerate(run.ticks):
             t_ns = number * period_ns
-            sent[t_ns] = b"".join(emulator.sense(t_ns))
+            sent[t_ns] = emulator.sense(t_ns)
             source.expect(0, t_ns)
             for stamp_us, frame in tick.answers:
                 source.feed(frame.raw)
@@ -53,6 +53,7 @@ def replay_in_process(run: Recorded) -> Difference:
                 else:
                     since_tick_ns = min(max(0, 1000 * (stamp_us - tick.stamp_us)), period_ns)
                     emulator.act(t_ns + since_tick_ns, 0)
+                emulator.settle()
             others, source.others = source.others, []
             emulator.hear(others)
             if not run.lockstep:

@@ -72,7 +72,6 @@ class Lockstep(Pacing):
                 self.process(data, t_ns)
                 if source.newest_ns == t_ns:
                     self.latencies_ns.append(came_ns - self.sent_ns)
-                    self.log_answer(t_ns)
                     return True
                 if source.strays > self._strays:
                     self._strays = source.strays
@@ -92,7 +91,7 @@ class Lockstep(Pacing):
         self.counters["foreign"] += len(raws)
         raws.clear()
 
-    def log_answer(self, t_ns: int) -> None:
+    def log_received(self, t_ns: int) -> None:
         """Log the frames of an answer, each once. Numbers restart at t = 0, so the first answer's own tells which are its."""
         source = self.emulator.source
         raws, source.raws = source.raws, []

@@ -57,19 +57,23 @@ class Pacing(abc.ABC):
         Raises PeerLostError where the controller fell silent, Interrupted where the user asked to stop, DivergenceError
         where the plant cannot go on; the tick's row is then recorded.
         """
-        self.stop.check()
+        if self.stop.requested:
+            self.stop.check()
         if not self._is_sent:
             self.begin(t_ns)
             self.send(t_ns)
         self._is_sent = False
         self.settle_books(t_ns)
         self.take_commands(t_ns)
-        self.move(t_ns)
-        following_ns = t_ns + self.period_ns
-        if self.sends_ahead and following_ns < self.end_ns:
-            self.send(following_ns)
-            self._is_sent = True
-        self.emulator.record(t_ns)  # like all books, kept while the next tick is on its way
+        try:
+            self.move(t_ns)
+            following_ns = t_ns + self.period_ns
+            if self.sends_ahead and following_ns < self.end_ns:
+                self.send(following_ns)
+                self._is_sent = True
+        finally:
+            self.log_received(t_ns)  # like all books, kept while the next tick is on its way
+        self.emulator.record(t_ns)
 
     sends_ahead = True
     """Whether a tick leaves as soon as the plant has reached it, before the books of the one before it are kept."""
@@ -91,11 +95,10 @@ class Pacing(abc.ABC):
 
     def send(self, t_ns: int) -> None:
         """Measure the plant at t_ns and send the tick."""
-        frames = self.emulator.sense(t_ns)
-        self.datagram = frames[0] + frames[1] if len(frames) == 2 else b"".join(frames)
+        self.datagram = self.emulator.sense(t_ns)
         self.sent_ns = self.clock.now_ns()
         self.endpoint.link.send(self.datagram)
-        self.owe_log(self.stamp_us(t_ns), frames)
+        self.owe_log(self.stamp_us(t_ns), self.emulator.frames())
 
     def process(self, data: bytes, t_ns: int) -> None:
         """Take all that came during the tick at t_ns, in its order: commands act, the rest is heard."""
@@ -103,7 +106,6 @@ class Pacing(abc.ABC):
         source.feed(data)
         while True:
             found = source.read()
-            self.note_received()
             if source.others:
                 others, source.others = source.others, []
                 self.hear(others)
@@ -112,8 +114,8 @@ class Pacing(abc.ABC):
             if source.is_read:
                 return
 
-    def note_received(self) -> None:  # noqa: B027  (lockstep logs an answer when it is whole)
-        """Log the frames that were just read."""
+    def log_received(self, t_ns: int) -> None:  # noqa: B027  (real time logs what comes as it comes)
+        """Log the frames that came upon the tick at t_ns."""
 
     def hear(self, frames: list[Frame]) -> None:
         """React to frames that are no commands."""

@@ -106,8 +106,9 @@ class RealTime(Pacing):
         """Take what came at came_ns, on the clock, during the period of the tick at t_ns."""
         self._came_ns, self._stamp_ns = came_ns, self.endpoint.link.received_ns
         self.process(data, t_ns)
+        self._log_what_came()
 
-    def note_received(self) -> None:
+    def _log_what_came(self) -> None:
         """Log what was read under the time it came."""
         source = self.emulator.source
         if source.raws:
@@ -122,6 +123,7 @@ class RealTime(Pacing):
         came_ns, answered_ns = self._came_ns, self.emulator.source.newest_ns
         since_ns = min(max(0, came_ns - self.sent_ns), self.period_ns)
         self.emulator.act(t_ns + since_ns, 0)
+        self.emulator.settle()
         self.latencies_ns.append(came_ns - self._sent.pop(answered_ns, came_ns))
         for lost_ns in [sent_ns for sent_ns in self._sent if sent_ns < answered_ns]:
             del self._sent[lost_ns]  # it will not be answered any more
@@ -130,7 +132,8 @@ class RealTime(Pacing):
             self.legs[1].add(answered_ns, self._stamp_ns, came_ns, applied_ns, t_ns + since_ns)
 
     def hear(self, frames: list[Frame]) -> None:
-        """React to frames that are no commands."""
+        """React to frames that are no commands; a question is logged before its answer."""
+        self._log_what_came()
         rest = []
         for frame in frames:
             if (frame.system, frame.component) == VEHICLE:

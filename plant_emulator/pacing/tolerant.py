@@ -45,7 +45,6 @@ class Tolerant(Lockstep):
         wait_ns = WAIT_NS if replied else self.period_ns
         if self.await_answer(t_ns, wait_ns):
             return
-        self.log_answer(t_ns)
         self.counters["unanswered"] += 1
         if source.newest_ns >= 0:
             self.counters["resent"] += 1
@@ -65,8 +64,9 @@ class Tolerant(Lockstep):
         self._flies = self._flies or source.armed
         if self._flies:
             self.emulator.act(t_ns, self.delay_ns)
+            self.emulator.settle()
 
-    def log_answer(self, t_ns: int) -> None:
+    def log_received(self, t_ns: int) -> None:
         """Log all that came; a foreign autopilot numbers its frames as it likes."""
         source = self.emulator.source
         raws, source.raws = source.raws, []

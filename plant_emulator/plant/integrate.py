@@ -236,13 +236,6 @@ def record_and_advance(
     return advance(state, parameters, parameters, t_ns, end_ns, parameters.substep_ns)
 
 
-@compiled
-def _record_and_advance_packed(
-    state: Packed, parameters: Packed, t_ns: int, end_ns: int, command: FloatArray, row: FloatArray
-) -> int:
-    return record_and_advance(state[0], parameters[0], t_ns, end_ns, command, row)
-
-
 class Plant:
     """The plant for callers in Python: `command` what the motors shall do and when, `advance` the time.
 
@@ -279,11 +272,6 @@ class Plant:
         """Integrate up to end_ns. Raises DivergenceError; the state is then the last one computed."""
         parameters = self.parameters[0]
         self.arrive(end_ns, advance(self.state.packed[0], parameters, parameters, self.t_ns, end_ns, self.substep_ns))
-
-    def record_and_advance(self, end_ns: int, command: FloatArray, row: FloatArray) -> None:
-        """Let the commands act whose time is now, fill the row (31,) of this moment (see `fill_row`), then `advance`."""
-        outcome = _record_and_advance_packed(self.state.packed, self.parameters, self.t_ns, end_ns, command, row)
-        self.arrive(end_ns, outcome)
 
     def specific_force(self) -> FloatArray:
         """What an accelerometer reads now (3,), m/s^2: a - g in the body frame."""

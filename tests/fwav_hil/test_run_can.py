@@ -96,7 +96,10 @@ def test_processes_that_stand_still_change_nothing(tmp_path: Path) -> None:
     with started("run", "flapper", "--motor", "can", "--can", free_group(), "--duration", "3", "--lag", "0", "--link", FREE,
                  "--out", folder, "--no-plots", cwd=tmp_path) as run:  # fmt: skip
         wait_until(lambda: flying(folder))
-        for process, time_s in ((processes_of(tmp_path).get("motor"), 3.5), (processes_of(tmp_path)["plant_emulator"], 2.2)):
+        for process, time_s in (
+            (processes_of(tmp_path).get("motor"), 3.5),
+            (processes_of(tmp_path)["plant_emulator"], 2.2),
+        ):
             assert process is not None
             os.kill(process, signal.SIGSTOP)
             with pytest.raises(subprocess.TimeoutExpired):

@@ -182,7 +182,7 @@ class TestAutopilot:
         emulator = Emulator(SCENARIO, endpoint, None)
         meet_autopilot(1.0, endpoint, StopFlag(), emulator)
         assert [ids for _, ids in link.sent] == [[BEAT]]
-        (first, *_) = FrameReader(is_datagram=True).read(b"".join(emulator.sense(0)))
+        (first, *_) = FrameReader(is_datagram=True).read(emulator.sense(0))
         assert first.message_id == ACK
 
     def test_a_stop_ends_it_at_once(self, monkeypatch: pytest.MonkeyPatch, stop: StopFlag) -> None:
