@@ -28,8 +28,9 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def fwav_hil(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Command]:
-    """Runs `fwav-hil` with arguments, in a folder of its own; returns the exit code."""
+    """Runs `fwav-hil` with arguments, in a folder of its own; returns the exit code. Nothing about compiling is said."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("fwav_hil.logs.choice.kernels_are_warm", lambda *_packages: True)
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     yield lambda *arguments: run_command(cli, "fwav-hil", [str(argument) for argument in arguments])
     for number, handler in handlers.items():
