@@ -16,6 +16,8 @@ from protocol.kernel_cache import PACKAGES
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+OF_ANOTHER_ENVIRONMENT = {ROOT / "tests" / "mutants.py"}
+"""cosmic-ray is not part of what `make test` installs."""
 OURS = {*PACKAGES, "tests", "benchmarks"}
 
 
@@ -40,7 +42,7 @@ BROUGHT_BY = {
 def modules_imported(folder: str) -> set[str]:
     """The top-level modules of others that the files of a folder import, wherever in them."""
     found: set[str] = set()
-    for source in (ROOT / folder).rglob("*.py"):
+    for source in {*(ROOT / folder).rglob("*.py")} - OF_ANOTHER_ENVIRONMENT:
         for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 found |= {alias.name.partition(".")[0] for alias in node.names}
@@ -52,7 +54,11 @@ def modules_imported(folder: str) -> set[str]:
 def distributions_imported(*folders: str) -> set[str]:
     """What is imported, by the name it is installed by: of several that share a module, the one declared."""
     modules = set().union(*map(modules_imported, folders))
-    return {name for module in modules for name in BROUGHT_BY[module] & DECLARED or BROUGHT_BY[module]}
+    return {
+        name
+        for module in modules
+        for name in BROUGHT_BY.get(module, {module}) & DECLARED or BROUGHT_BY.get(module, {module})
+    }
 
 
 def test_the_packages_import_what_is_declared_and_nothing_else() -> None:
