@@ -107,12 +107,13 @@ def names_in(log: Log) -> list[str]:
 
 def held_names(types: Sequence[str], held: Collection[str], where: object) -> list[str]:
     """The names of an option that may be repeated and may hold several, in any case. Raises UsageError for one not held."""
-    by_upper = {name.upper(): name for name in held}
+    by_upper = {name.upper(): name for name in held} | {name: name for name in held}
     names = []
     for name in (name.strip() for item in types for name in item.split(",") if name.strip()):
-        if name.upper() not in by_upper:
+        found = by_upper.get(name) or by_upper.get(name.upper())
+        if found is None:
             raise UsageError(f"--types {name}: {where} holds no such message{near_matches(name, held)}")
-        names.append(by_upper[name.upper()])
+        names.append(found)
     return names
 
 

@@ -9,9 +9,7 @@ What is written has its final name only once it is whole.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fwav_hil.logs.choice import Choice
+from fwav_hil.logs.outputs import file_names, whole
 from fwav_hil.logs.working import Working
-from protocol.errors import RunFolderError
 from protocol.logs.files import Log, fields_of, plain
 
 SUFFIXES = {"parquet": "_parquet", "csv": "_csv", "mcap": ".mcap"}
@@ -47,43 +45,18 @@ def export_log(log: Log, kind: str, out: Path, choice: Choice) -> dict[str, Any]
         _write_parquet if kind == "parquet" else _write_csv
     )
     total = sum(map(len, made.values()))
+    files = {name: f"{safe}.{kind}" for name, safe in file_names(made).items()}
     with whole(out) as partial, Working(f"writing {out.name}") as working:
         partial.mkdir()
         before = 0
         for name, table in made.items():
-            write(name, table, partial / f"{name}.{kind}", lambda rows, before=before: working(before + rows, total))  # type: ignore[misc]
+            write(name, table, partial / files[name], lambda rows, before=before: working(before + rows, total))  # type: ignore[misc]
             before += len(table)
     return {
         "out": str(out),
-        "files": [f"{name}.{kind}" for name in made],
+        "files": list(files.values()),
         "messages": {name: len(table) for name, table in made.items()},
     }
-
-
-@contextmanager
-def whole(out: Path) -> Iterator[Path]:
-    """A name beside `out` to write to, a file or a folder; it becomes `out` at the end, or is removed.
-
-    Raises RunFolderError where `out` is there already or cannot be written.
-    """
-    if out.exists():
-        raise RunFolderError(f"{out} is there already and stays: choose another place with --out")
-    partial = out.with_name(out.name + ".part")
-    _remove(partial)
-    try:
-        yield partial
-        partial.rename(out)
-    except OSError as error:
-        raise RunFolderError(f"cannot write {out}: {error.strerror or error}") from None
-    finally:
-        _remove(partial)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
 
 
 def _chunks(table: npt.NDArray[np.void]) -> Iterator[npt.NDArray[np.void]]:

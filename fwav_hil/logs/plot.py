@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +13,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from fwav_hil.logs.choice import Choice, near_matches
-from protocol.errors import RunFolderError, UsageError
+from fwav_hil.logs.outputs import whole
+from protocol.errors import UsageError
 from protocol.logs.dialect import unit
 from protocol.logs.files import Log, fields_of
 
@@ -100,17 +100,5 @@ def plot_log(log: Log, fields: Sequence[str], choice: Choice, path: Path) -> Non
             columns = 1 + (len(lines) - 1) // 8
             panel.legend(loc="upper left", bbox_to_anchor=(1.0, 1.02), fontsize="x-small", ncols=columns)
     axes[-1, 0].set_xlabel("time from the log's beginning (s)")
-    _save(figure, path)
-
-
-def _save(figure: Figure, path: Path) -> None:
-    if path.exists():
-        raise RunFolderError(f"{path} is there already and stays: choose another file with --out")
-    partial = path.with_name(path.name + ".part")
-    try:
+    with whole(path) as partial:
         figure.savefig(partial, dpi=110, format="png")
-        partial.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink()
-        raise RunFolderError(f"cannot write the plot {path}: {error.strerror}") from None

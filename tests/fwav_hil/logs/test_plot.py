@@ -55,14 +55,14 @@ def test_a_picture_that_is_there_stays(shell: Shell, flight_log: Path, tmp_path:
     ended = shell("plot", flight_log, "ATT_POS_MOCAP.x", "--out", "a.png")
     assert (ended.code, ended.err) == (
         6,
-        "fwav-hil: a.png is there already and stays: choose another file with --out\n",
+        "fwav-hil: a.png is there already and stays: choose another place with --out\n",
     )
     assert (tmp_path / "a.png").read_bytes() == b"mine"
 
 
 def test_a_place_that_cannot_be_written(shell: Shell, flight_log: Path) -> None:
     ended = shell("plot", flight_log, "ATT_POS_MOCAP.x", "--out", "no/such/a.png")
-    assert (ended.code, ended.err) == (6, "fwav-hil: cannot write the plot no/such/a.png: No such file or directory\n")
+    assert (ended.code, ended.err) == (6, "fwav-hil: cannot write no/such/a.png: No such file or directory\n")
 
 
 @pytest.mark.parametrize(
