@@ -1,13 +1,14 @@
 # make run    build the environment, fly the default scenario
 # make test   the same environment, the whole test suite
 # make check  what CI runs: test, lint, types, layers
+# make fuzz   100 000 damaged logs of each format for the readers; takes hours, so CI has 100 of each among its tests
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 EXTRAS := can,logs,plots,studies,dev
 
-.PHONY: run test check lint types layers bench clean
+.PHONY: run test check lint types layers bench fuzz clean
 .DELETE_ON_ERROR:
 
 run: $(READY)
@@ -30,6 +31,9 @@ layers: $(READY)
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks
+
+fuzz: $(READY)
+	$(BIN)/python -m tests.fuzz
 
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

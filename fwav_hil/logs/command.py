@@ -59,7 +59,7 @@ def dump_command(
 
     opened = open_with_progress(log)
     choice = choose(opened, types, systems, start, end)
-    chosen = messages(opened, choice.names, between_us=choice.between_us, senders=choice.senders)
+    chosen = messages(opened, choice.names, between_us=choice.between_us, senders=choice.senders, for_json=as_json)
     lines = json_lines(chosen) if as_json else text_lines(chosen, opened.span_us()[0])
     sys.stdout.writelines(lines)
     sys.stdout.flush()
@@ -118,5 +118,7 @@ def export_command(
         choose_frames(opened, opened.scan, choice)  # says so where nothing is left
     result = export_log(opened, kinds[0], out or default_output(log, kinds[0]), choice)
     messages = sum(result["messages"].values())
-    click.echo(f"{result['out']}: {messages} messages of {len(result['messages'])} kinds", err=is_stdout(json_path))
+    unknown = f"; left out: {result['unknown_frames']} frames of unknown messages" if result["unknown_frames"] else ""
+    kinds_written = f"{messages} messages of {len(result['messages'])} kinds"
+    click.echo(f"{result['out']}: {kinds_written}{unknown}", err=is_stdout(json_path))
     show_json(json_path, result)

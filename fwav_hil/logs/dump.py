@@ -31,7 +31,7 @@ def _shown(value: Any) -> str:
 
 
 def json_lines(messages: Iterable[Message]) -> Iterator[str]:
-    """`{"t_us", "type", "system", "component", "sequence", "fields"}`; NaN and infinities are null."""
+    """`{"t_us", "type", "system", "component", "sequence", "fields"}`; NaN is null, infinities are text."""
     encode = msgspec.json.Encoder().encode
     for message in messages:
         record = {

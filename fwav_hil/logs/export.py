@@ -13,16 +13,21 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from fwav_hil.logs.choice import Choice
 from fwav_hil.logs.outputs import file_names, whole
 from fwav_hil.logs.working import Working
-from protocol.logs.files import Log, fields_of, plain
+from protocol.logs.files import Log, chosen_rows, fields_of, plain
+from protocol.logs.record_table import Unit
 
 SUFFIXES = {"parquet": "_parquet", "csv": "_csv", "mcap": ".mcap"}
+UNITS = "units.json"
+"""Beside CSV files, which cannot hold units: those that the log itself says, by message and field."""
 _ROWS_AT_ONCE = 1 << 17
+Pieces = Iterator[npt.NDArray[np.void]]
 
 
 def default_output(log: Path, kind: str) -> Path:
@@ -33,52 +38,76 @@ def default_output(log: Path, kind: str) -> Path:
 def export_log(log: Log, kind: str, out: Path, choice: Choice) -> dict[str, Any]:
     """Write the log to `out`, which must not be there yet: a file for mcap, else a folder.
 
-    Returns out, files and messages (counts by name). Raises RunFolderError.
+    Returns out, files, messages (counts by name) and unknown_frames (of the chosen, those that no export can hold). Of a
+    message no more than a piece is in memory at once. Raises RunFolderError.
     """
+    unknown = {"unknown_frames": unknown_frames(log, choice)}
     if kind == "mcap":
         from fwav_hil.logs.mcap_file import write_mcap
 
         with whole(out) as partial, Working(f"writing {out.name}") as working:
-            return {"out": str(out), "files": [out.name], "messages": write_mcap(log, partial, choice, working)}
-    made = log.tables(choice.names, between_us=choice.between_us, senders=choice.senders)
-    write: Callable[[str, npt.NDArray[np.void], Path, Callable[[int], None]], None] = (
-        _write_parquet if kind == "parquet" else _write_csv
-    )
-    total = sum(map(len, made.values()))
-    files = {name: f"{safe}.{kind}" for name, safe in file_names(made).items()}
+            counts = write_mcap(log, partial, choice, working)
+            return {"out": str(out), "files": [out.name], "messages": counts, **unknown}
+    counts = log.counts(choice.names, between_us=choice.between_us, senders=choice.senders)
+    write: Callable[[Log, str, Path, Pieces], None] = _write_parquet if kind == "parquet" else _write_csv
+    files = {name: f"{safe}.{kind}" for name, safe in file_names(counts, [Path(UNITS).stem]).items()}
+    units = {name: found for name in counts if (found := _units(log, name))}
     with whole(out) as partial, Working(f"writing {out.name}") as working:
         partial.mkdir()
-        before = 0
-        for name, table in made.items():
-            write(name, table, partial / files[name], lambda rows, before=before: working(before + rows, total))  # type: ignore[misc]
-            before += len(table)
-    return {
-        "out": str(out),
-        "files": list(files.values()),
-        "messages": {name: len(table) for name, table in made.items()},
-    }
+        before, total = 0, sum(counts.values())
+        for name, count in counts.items():
+            pieces = log.pieces(name, _ROWS_AT_ONCE, between_us=choice.between_us, senders=choice.senders)
+            write(log, name, partial / files[name], _told(pieces, before, total, working))
+            before += count
+        if units and kind == "csv":
+            (partial / UNITS).write_bytes(msgspec.json.format(msgspec.json.encode(units)))
+    return {"out": str(out), "files": list(files.values()), "messages": counts, **unknown}
 
 
-def _chunks(table: npt.NDArray[np.void]) -> Iterator[npt.NDArray[np.void]]:
-    for start in range(0, len(table), _ROWS_AT_ONCE):
-        yield table[start : start + _ROWS_AT_ONCE]
+def unknown_frames(log: Log, choice: Choice) -> int:
+    """How many of the chosen frames are of messages that the dialect lacks, so that nothing says what is in them."""
+    if log.scan is None or choice.names is not None:
+        return 0
+    rows = chosen_rows(log.scan, choice.between_us, choice.senders)
+    unknown = log.scan.frames["known"] == 0
+    return int(np.count_nonzero(unknown if rows is None else unknown & rows))
+
+
+def _told(pieces: Pieces, before: int, total: int, working: Working) -> Pieces:
+    for piece in pieces:
+        yield piece
+        before += len(piece)
+        working(before, total)
+
+
+def _units(log: Log, name: str) -> dict[str, dict[str, Any]]:
+    """The units of a message of a log that says them itself, by field."""
+    table = log.records.get(name)
+    return {field: unit._asdict() for field, unit in table.units.items()} if table else {}
 
 
 def _head(table: npt.NDArray[np.void]) -> list[str]:
     return ["system", "component", "frame_sequence"] if "frame_sequence" in (table.dtype.names or ()) else []
 
 
-def _write_parquet(name: str, table: npt.NDArray[np.void], path: Path, told: Callable[[int], None]) -> None:
+def _write_parquet(log: Log, name: str, path: Path, pieces: Pieces) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    columns = ["t_us", *_head(table), *fields_of(table)]
-    first = _arrow({column: table[column][:0] for column in columns})
-    with pq.ParquetWriter(path, first.schema.with_metadata({"message": name})) as writer:
-        for number, rows in enumerate(_chunks(table)):
-            part = _arrow({column: rows[column] for column in columns})
-            writer.write_table(pa.Table.from_arrays(part.columns, schema=writer.schema))
-            told(min(len(table), (number + 1) * _ROWS_AT_ONCE))
+    writer = None
+    for rows in pieces:
+        columns = ["t_us", *_head(rows), *fields_of(rows)]
+        part = _arrow({column: rows[column] for column in columns})
+        if writer is None:
+            fields = [_with_unit(field, log.unit(name, field.name)) for field in part.schema]
+            writer = pq.ParquetWriter(path, pa.schema(fields, metadata={"message": name}))
+        writer.write_table(pa.Table.from_arrays(part.columns, schema=writer.schema))
+    if writer is not None:
+        writer.close()
+
+
+def _with_unit(field: Any, unit: Unit) -> Any:
+    return field.with_metadata({"unit": unit.name, "multiplier": repr(unit.multiplier)}) if unit.name else field
 
 
 def _arrow(columns: dict[str, npt.NDArray[Any]]) -> Any:
@@ -86,8 +115,10 @@ def _arrow(columns: dict[str, npt.NDArray[Any]]) -> Any:
 
     made = {}
     for name, column in columns.items():
-        if column.dtype.kind == "S":
+        if column.dtype.kind in "SO":
             made[name] = pa.array(plain(column), type=pa.string())
+        elif column.dtype.kind == "V":
+            made[name] = pa.array(column.tolist(), type=pa.binary(column.dtype.itemsize))
         elif column.ndim > 1:
             flat = pa.array(np.ascontiguousarray(column).reshape(-1))
             made[name] = pa.FixedSizeListArray.from_arrays(flat, column.shape[1])
@@ -96,23 +127,24 @@ def _arrow(columns: dict[str, npt.NDArray[Any]]) -> Any:
     return pa.table(made)
 
 
-def _write_csv(name: str, table: npt.NDArray[np.void], path: Path, told: Callable[[int], None]) -> None:
+def _write_csv(_log: Log, _name: str, path: Path, pieces: Pieces) -> None:
     import pyarrow.csv as arrow_csv
 
     writer = None
-    for number, rows in enumerate(_chunks(table)):
+    for rows in pieces:
         columns: dict[str, npt.NDArray[Any]] = {"time_s": rows["t_us"] / 1e6}
-        columns |= {column: rows[column] for column in _head(table)}
-        for field in fields_of(table):
+        columns |= {column: rows[column] for column in _head(rows)}
+        for field in fields_of(rows):
             value = rows[field]
             if value.ndim > 1:
                 columns |= {f"{field}[{element}]": value[:, element] for element in range(value.shape[1])}
+            elif value.dtype.kind == "V":
+                columns[field] = np.array(plain(value), dtype=f"S{2 * value.dtype.itemsize}")
             else:
                 columns[field] = value
         part = _without_nan(_arrow(columns))
         writer = writer or arrow_csv.CSVWriter(path, part.schema)
         writer.write_table(part)
-        told(min(len(table), (number + 1) * _ROWS_AT_ONCE))
     if writer:
         writer.close()
 

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bridge.recording.sidecar import link_numbers, read_sidecar
+from fwav_hil.tables import plain_console
 from protocol.errors import RunFolderError
 from protocol.logs.dialect import layouts
 from protocol.logs.files import Log
@@ -23,6 +24,7 @@ GAP = 3.0
 PLACES_SHOWN = 20
 _WIDTH_ELSEWHERE = 120
 """Columns where there is no terminal: no name is cut off."""
+_SHOWN_INFORMATION = ("sys_name", "ver_hw", "ver_sw", "ver_sw_branch", "replay")
 _YEAR_2000_S = 946_684_800.0
 
 
@@ -32,10 +34,11 @@ def log_info(log: Log) -> dict[str, Any]:
     kind, bytes, start_s (of the first record), duration_s, messages, rate_hz; systems (MAVLink logs: system, component,
     messages, lost, out_of_order, versions, signed); types (name, system, component, count, rate_hz, interval_s: the median,
     gaps, longest_gap_s); recording (of a log of this project, by its sidecar: complete, lost, error, stamps, links: uri, peer,
-    sent and received frames); damage (counters, and places: offset and bytes of the first stretches of damage).
+    sent and received frames); content (of a PX4 log: how many topics, logged_messages, parameters and so on, and its
+    information by key); damage (counters, and places: offset and bytes of the first stretches of damage).
     """
     first, last = log.span_us()
-    count = len(log.scan) if log.scan is not None else sum(len(table) for table in log.tables().values())
+    count = len(log.scan) if log.scan is not None else sum(map(len, log.records.values()))
     duration_s = (last - first) / 1e6
     return {
         "log": str(log.path),
@@ -48,6 +51,7 @@ def log_info(log: Log) -> dict[str, Any]:
         "systems": _systems(log.scan) if log.scan is not None else [],
         "types": _types_of_scan(log.scan) if log.scan is not None else _types_of_tables(log),
         "recording": _recording(log),
+        "content": dict(log.said),
         "damage": dict(log.counters) | ({"places": _places(log.scan)} if log.scan is not None else {}),
     }
 
@@ -112,7 +116,7 @@ def _types_of_scan(scan: Scan) -> list[dict[str, Any]]:
 
 def _types_of_tables(log: Log) -> list[dict[str, Any]]:
     return [
-        {"name": name, "system": None, "component": None} | _pace(table["t_us"]) for name, table in log.tables().items()
+        {"name": name, "system": None, "component": None} | _pace(table.t_us) for name, table in log.records.items()
     ]
 
 
@@ -142,9 +146,7 @@ def _places(scan: Scan) -> list[dict[str, int]]:
 def print_info(info: dict[str, Any], *, to_stderr: bool = False) -> None:
     """Print what `log_info` gives."""
     stream = sys.stderr if to_stderr else sys.stdout
-    console = Console(
-        highlight=False, soft_wrap=True, stderr=to_stderr, width=None if stream.isatty() else _WIDTH_ELSEWHERE
-    )
+    console = plain_console(to_stderr=to_stderr, width=None if stream.isatty() else _WIDTH_ELSEWHERE)
     rate = f", {info['rate_hz']:.0f} a second" if info["rate_hz"] else ""
     console.print(f"{info['log']}: {info['kind']}, {info['bytes']} bytes")
     console.print(
@@ -152,6 +154,8 @@ def print_info(info: dict[str, Any], *, to_stderr: bool = False) -> None:
     )
     if info["recording"]:
         _print_recording(console, info["recording"])
+    if info["content"]:
+        _print_content(console, info["content"])
     if info["systems"]:
         console.print(_systems_table(info["systems"]))
     console.print(_types_table(info["types"]))
@@ -173,6 +177,17 @@ def _print_recording(console: Console, recording: dict[str, Any]) -> None:
     for link in recording["links"]:
         peer = f" ({link['peer']})" if link["peer"] else ""
         console.print(f"link {link['uri']}{peer}: {link['sent']} frames sent, {link['received']} received")
+
+
+def _print_content(console: Console, content: dict[str, Any]) -> None:
+    """What a PX4 log holds besides, and which system it is of."""
+    counts = {"topics": 0, "logged_messages": 0, "parameters": 0} | {
+        name: value for name, value in content.items() if name != "information"
+    }
+    console.print(", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items()))
+    said = [f"{key} {content['information'][key]}" for key in _SHOWN_INFORMATION if key in content["information"]]
+    if said:
+        console.print(", ".join(said))
 
 
 def _moment(t_s: float) -> str:

@@ -15,11 +15,10 @@ from matplotlib.figure import Figure
 from fwav_hil.logs.choice import Choice, near_matches
 from fwav_hil.logs.outputs import whole
 from protocol.errors import UsageError
-from protocol.logs.dialect import unit
 from protocol.logs.files import Log, fields_of
 
 MOST_LINES = 16
-_FIELD = re.compile(r"(?P<message>\w+)\.(?P<field>\w+)(?:\[(?P<index>\d+)\])?$")
+_FIELD = re.compile(r"(?P<message>[^.]+)\.(?P<field>.+?)(?:\[(?P<index>\d+)\])?$")
 
 
 class Line(NamedTuple):
@@ -93,7 +92,7 @@ def plot_log(log: Log, fields: Sequence[str], choice: Choice, path: Path) -> Non
             marker = "." if len(line.t_s) < 200 else None
             panel.plot(line.t_s, line.values, linewidth=0.9, marker=marker, label=line.label)
         message, _, field = wanted.partition(".")
-        shown = unit(message, field.partition("[")[0])
+        shown = str(log.unit(message, re.sub(r"\[\d+\]$", "", field)))
         panel.set_title(wanted + (f" ({shown})" if shown else ""), fontsize="medium")
         panel.grid(visible=True, alpha=0.3)
         if len(lines) > 1:

@@ -32,7 +32,7 @@ class Working:
             sys.stderr.flush()
             return
         if self._bar is None:
-            columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TimeRemainingColumn()
+            columns = TextColumn("{task.description}", markup=False), BarColumn(bar_width=24), TimeRemainingColumn()
             self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
             self._task = self._bar.add_task(self._what, total=total)
             self._bar.start()

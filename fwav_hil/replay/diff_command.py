@@ -55,12 +55,13 @@ def diff_command(
 
 def _print(difference: LogDifference, *, to_stderr: bool) -> None:
     """The fields beyond their tolerances, in the order in which they part, and what has no partner."""
-    from rich.console import Console
     from rich.table import Table
+
+    from fwav_hil.tables import plain_console
 
     stream = sys.stderr if to_stderr else sys.stdout
     width = None if stream.isatty() else 120  # no name is cut off in a file
-    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr, width=width)
+    console = plain_console(to_stderr=to_stderr, width=width)
     beyond = sorted((f for f in difference.fields if f.beyond), key=lambda f: (f.first_s or 0.0, f.message, f.field))
     if beyond:
         table = Table("field", "sender")

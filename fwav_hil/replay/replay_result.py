@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
 from rich.table import Table
 
+from fwav_hil.tables import plain_console
 from protocol.messages import AXES, AXIS_UNITS, FloatArray
 
 _SHOWN = {
@@ -65,7 +65,7 @@ class Difference(NamedTuple):
 
 def print_difference(difference: Difference, title: str, *, to_stderr: bool) -> None:
     """Say in a line, or a table, how far the replay is from the record."""
-    console = Console(highlight=False, soft_wrap=True, stderr=to_stderr)
+    console = plain_console(to_stderr=to_stderr)
     figures = difference.figures()
     if difference.is_zero:
         console.print(f"{title}: no difference in {figures['samples']} samples, to the byte")

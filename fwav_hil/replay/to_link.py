@@ -189,7 +189,7 @@ class _Display:
         if sys.stderr.isatty():
             columns = (TextColumn("replaying"), BarColumn(bar_width=30), TextColumn("{task.description}"))
             # Drawn by hand: the thread that would draw it holds the interpreter when a frame is due.
-            self._bar = Bar(*columns, console=Console(stderr=True), auto_refresh=False)
+            self._bar = Bar(*columns, console=Console(stderr=True, markup=False, emoji=False), auto_refresh=False)
             self._task = self._bar.add_task("", total=frames)
 
     def say(self, text: str) -> None:

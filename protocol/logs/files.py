@@ -1,23 +1,26 @@
-"""A log of any kind that is read: MAVLink telemetry, ArduPilot's .BIN, PX4's .ulg; told apart by their first bytes."""
+"""A log of any kind that is read: MAVLink telemetry, ArduPilot's .BIN and .log, PX4's .ulg; told apart by their first bytes."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from protocol.errors import LogError
-from protocol.logs.dialect import layouts
+from protocol.logs.dialect import layouts, layouts_by_name, unit
+from protocol.logs.record_table import RecordTable, Unit
 from protocol.logs.scan import Progress, Scan, scan_tlog
-from protocol.logs.tables import HEAD, Tables, tables
+from protocol.logs.tables import HEAD, Tables, row_counts, tables
 
 TELEMETRY, RAW = "MAVLink telemetry log", "raw MAVLink stream (no time stamps)"
-ARDUPILOT, PX4 = "ArduPilot dataflash log", "PX4 log"
+ARDUPILOT, ARDUPILOT_TEXT, PX4 = "ArduPilot dataflash log", "ArduPilot dataflash log as text", "PX4 log"
 _CHUNK = 1 << 15
+_FIRST_BYTES = 8192
 
 Sender = tuple[int, int | None]
 """A system and one component of it; None is all of them."""
@@ -25,18 +28,25 @@ Sender = tuple[int, int | None]
 
 @dataclass(frozen=True)
 class Log:
-    """A log. `scan` is there for MAVLink logs only, `counters` say what was amiss."""
+    """A log.
+
+    scan      the frames, of MAVLink logs only
+    counters  what was amiss
+    records   the tables of logs that autopilots wrote of themselves
+    said      what such a log says of itself (PX4: topics, logged_messages, parameters ... counted, information)
+    """
 
     path: Path
     kind: str
     scan: Scan | None
     counters: Mapping[str, int]
-    _tables: Tables
+    records: Mapping[str, RecordTable] = field(default_factory=dict)
+    said: Mapping[str, Any] = field(default_factory=dict)
 
     def names(self) -> list[str]:
         """The messages that the log holds, unknown ones apart."""
         if self.scan is None:
-            return list(self._tables)
+            return list(self.records)
         known = self.scan.frames[self.scan.frames["known"] == 1]
         return [layouts()[int(number)].name for number in np.unique(known["message_id"])]
 
@@ -45,7 +55,7 @@ class Log:
         if self.scan is not None:
             stamps = [self.scan.frames["stamp_us"]]
         else:
-            stamps = [table["t_us"] for table in self._tables.values() if len(table)]
+            stamps = [table.t_us for table in self.records.values() if len(table)]
         return int(min(column.min() for column in stamps)), int(max(column.max() for column in stamps))
 
     def tables(
@@ -61,11 +71,61 @@ class Log:
         """
         if self.scan is not None:
             return tables(self.scan, names, chosen_rows(self.scan, between_us, senders))
-        made = {name: table for name, table in self._tables.items() if names is None or name in names}
-        if between_us is None:
-            return made
-        cut = {n: t[(t["t_us"] >= between_us[0]) & (t["t_us"] <= between_us[1])] for n, t in made.items()}
-        return {name: table for name, table in cut.items() if len(table)}
+        chosen = self._chosen(names, between_us)
+        return {name: self.records[name].rows(numbers) for name, numbers in chosen.items()}
+
+    def counts(
+        self,
+        names: Collection[str] | None = None,
+        *,
+        between_us: tuple[int, int] | None = None,
+        senders: Collection[Sender] | None = None,
+    ) -> dict[str, int]:
+        """How many rows each of the tables has that `tables` gives, without making them."""
+        if self.scan is not None:
+            return row_counts(self.scan, names, chosen_rows(self.scan, between_us, senders))
+        return {name: len(numbers) for name, numbers in self._chosen(names, between_us).items()}
+
+    def pieces(
+        self,
+        name: str,
+        rows: int,
+        *,
+        between_us: tuple[int, int] | None = None,
+        senders: Collection[Sender] | None = None,
+    ) -> Iterator[npt.NDArray[np.void]]:
+        """The table of a message piece by piece, `rows` at once: no more of it is in memory."""
+        if self.scan is None:
+            numbers = self._chosen([name], between_us).get(name, np.zeros(0, dtype=np.int64))
+            for start in range(0, len(numbers), rows):
+                yield self.records[name].rows(numbers[start : start + rows])
+            return
+        chosen = self.scan.frames["message_id"] == layouts_by_name()[name].message_id
+        if (mask := chosen_rows(self.scan, between_us, senders)) is not None:
+            chosen &= mask
+        numbers = np.flatnonzero(chosen)
+        for start in range(0, len(numbers), rows):
+            part = self.scan.part(numbers[start : start + rows])
+            yield from tables(part, [name]).values()
+
+    def unit(self, message: str, name: str) -> Unit:
+        """The unit of a field, and what its values are to be multiplied by; empty where nothing says it."""
+        if self.scan is not None:
+            return Unit(unit(message, name))
+        table = self.records.get(message)
+        return table.units.get(name, Unit("")) if table else Unit("")
+
+    def _chosen(
+        self, names: Collection[str] | None, between_us: tuple[int, int] | None
+    ) -> dict[str, npt.NDArray[np.int64]]:
+        """Of the chosen tables that have rows, the numbers of the chosen ones."""
+        found = {}
+        for name, table in self.records.items():
+            if names is None or name in names:
+                numbers = np.arange(len(table)) if between_us is None else table.between(*between_us)
+                if len(numbers):
+                    found[name] = numbers
+        return found
 
 
 def chosen_rows(
@@ -91,32 +151,32 @@ def open_log(path: Path, *, progress: Progress | None = None) -> Log:
     """Read a log of any of the kinds above. Raises LogError where it cannot be read, or is none."""
     try:
         with path.open("rb") as file:
-            first = file.read(8)
+            first = file.read(_FIRST_BYTES)
     except OSError as error:
         raise LogError(f"cannot read the log {path}: {error.strerror}") from None
-    from protocol.logs import (
-        ardupilot,
-        px4,  # they load what only such logs need
-    )
+    from protocol.logs import ardupilot, ardupilot_text, px4  # they load what only such logs need
 
     try:
-        if first.startswith(px4.MAGIC):
-            made, counters = px4.read_px4(path)
-            return _not_empty(Log(path, PX4, None, counters, made))
+        if first.startswith(px4.MAGIC) or first.startswith(px4.ENCRYPTED):
+            read = px4.read_px4(path, progress)
+            return _not_empty(Log(path, PX4, None, read.counters, read.tables, read.said))
         if first.startswith(ardupilot.MAGIC):
-            made, counters = ardupilot.read_ardupilot(path)
+            made, counters = ardupilot.read_ardupilot(path, progress)
             return _not_empty(Log(path, ARDUPILOT, None, counters, made))
+        if ardupilot_text.is_ardupilot_text(first):
+            made, counters = ardupilot_text.read_ardupilot_text(path, progress)
+            return _not_empty(Log(path, ARDUPILOT_TEXT, None, counters, made))
     except OSError as error:
         raise LogError(f"cannot read the log {path}: {error.strerror}") from None
     scan = scan_tlog(path, progress=progress)
-    return _not_empty(Log(path, TELEMETRY if scan.stamp_size else RAW, scan, scan.counters, {}))
+    return _not_empty(Log(path, TELEMETRY if scan.stamp_size else RAW, scan, scan.counters))
 
 
 def _not_empty(log: Log) -> Log:
-    if (len(log.scan) if log.scan is not None else sum(map(len, log._tables.values()))) == 0:
+    if (len(log.scan) if log.scan is not None else sum(map(len, log.records.values()))) == 0:
         raise LogError(
-            f"{log.path} holds no message: it is neither MAVLink telemetry (.tlog, raw) nor a log of ArduPilot (.BIN) "
-            "or PX4 (.ulg)"
+            f"{log.path} holds no message: it is neither MAVLink telemetry (.tlog, raw) nor a log of ArduPilot (.BIN, "
+            ".log) or PX4 (.ulg)"
         )
     return log
 
@@ -133,6 +193,18 @@ class Message:
     fields: dict[str, Any]
 
 
+class Part(NamedTuple):
+    """Some messages of a log, as tables and in their order.
+
+    order    of each message, which of the tables (by its place among them) holds it, as its next row; -1: `unknown` does
+    unknown  messages that the dialect lacks
+    """
+
+    tables: Tables
+    order: npt.NDArray[np.int64]
+    unknown: list[Message]
+
+
 def messages(
     log: Log,
     names: Collection[str] | None = None,
@@ -140,58 +212,78 @@ def messages(
     between_us: tuple[int, int] | None = None,
     senders: Collection[Sender] | None = None,
     unknown: bool = True,
+    for_json: bool = False,
 ) -> Iterator[Message]:
     """Message by message: in the order of the file, or of time where the log is one that an autopilot wrote itself.
 
     A message the dialect lacks is called UNKNOWN_ and its number, and has its payload in hexadecimal; `unknown` False
-    leaves it out.
+    leaves it out. `for_json`: see `plain`.
     """
+    for part in parts(log, names, between_us=between_us, senders=senders, unknown=unknown):
+        queues = [_rows(name, table, for_json=for_json) for name, table in part.tables.items()]
+        queues.append(iter(part.unknown))
+        for at in part.order.tolist():
+            yield next(queues[at])
+
+
+def parts(
+    log: Log,
+    names: Collection[str] | None = None,
+    *,
+    between_us: tuple[int, int] | None = None,
+    senders: Collection[Sender] | None = None,
+    unknown: bool = True,
+) -> Iterator[Part]:
+    """The messages that `messages` gives, some thousand at once, as tables."""
     if log.scan is None:
-        yield from _by_time(log.tables(names, between_us=between_us, senders=senders))
+        yield from _parts_by_time(log, names, between_us)
         return
     scan = log.scan
     chosen = chosen_rows(scan, between_us, senders)
     for start in range(0, len(scan), _CHUNK):
-        part = Scan(scan.path, scan.data, scan.frames[start : start + _CHUNK], scan.stamp_size, scan.counters)
-        mask = None if chosen is None else chosen[start : start + _CHUNK]
-        yield from _in_order(part, names, mask, unknown=unknown)
+        rows = np.arange(start, min(start + _CHUNK, len(scan)))
+        yield _part_of_scan(scan.part(rows if chosen is None else rows[chosen[rows]]), names, unknown=unknown)
 
 
-def _in_order(
-    part: Scan, names: Collection[str] | None, mask: npt.NDArray[np.bool_] | None, *, unknown: bool
-) -> Iterator[Message]:
-    queues = {name: _rows(name, table) for name, table in tables(part, names, mask).items()}
-    by_number = {number: queues.get(message.name) for number, message in layouts().items()}
-    numbers, flags = part.frames["message_id"].tolist(), part.frames["flags"].tolist()
-    for row, (number, known) in enumerate(zip(numbers, part.frames["known"].tolist(), strict=True)):
-        if mask is not None and not mask[row]:
-            continue
-        if known:
-            queue = by_number[number]
-            if queue is not None and not flags[row] & 0xFE:
-                yield next(queue)
-        elif unknown and (names is None or f"UNKNOWN_{number}" in names):
-            frame = part.frames[row]
+def _part_of_scan(part: Scan, names: Collection[str] | None, *, unknown: bool) -> Part:
+    made = tables(part, names)
+    frames = part.frames
+    order = np.full(len(part), -2, dtype=np.int64)
+    readable = (frames["known"] == 1) & (frames["flags"] & 0xFE == 0)
+    for at, name in enumerate(made):
+        order[readable & (frames["message_id"] == layouts_by_name()[name].message_id)] = at
+    others = []
+    for row in np.flatnonzero(frames["known"] == 0).tolist() if unknown else ():
+        frame = frames[row]
+        name = f"UNKNOWN_{frame['message_id']}"
+        if names is None or name in names:
             sender = int(frame["system"]), int(frame["component"]), int(frame["sequence"])
-            fields = {"payload": part.payload(row).hex()}
-            yield Message(int(frame["stamp_us"]), f"UNKNOWN_{number}", *sender, fields)
+            others.append(Message(int(frame["stamp_us"]), name, *sender, {"payload": part.payload(row).hex()}))
+            order[row] = -1
+    return Part(made, order[order > -2], others)
 
 
-def _by_time(made: Tables) -> Iterator[Message]:
-    queues = [_rows(name, table) for name, table in made.items()]
-    if not queues:
+def _parts_by_time(log: Log, names: Collection[str] | None, between_us: tuple[int, int] | None) -> Iterator[Part]:
+    chosen = log._chosen(names, between_us)
+    if not chosen:
         return
-    source = np.concatenate([np.full(len(table), at) for at, table in enumerate(made.values())])
-    times = np.concatenate([table["t_us"] for table in made.values()])
-    for at in source[np.argsort(times, kind="stable")].tolist():
-        yield next(queues[at])
+    sources = np.concatenate([np.full(len(numbers), at) for at, numbers in enumerate(chosen.values())])
+    every = np.concatenate(list(chosen.values()))
+    times = np.concatenate([log.records[name].t_us[numbers] for name, numbers in chosen.items()])
+    by_time = np.argsort(times, kind="stable")
+    del times
+    for start in range(0, len(by_time), _CHUNK):
+        some = by_time[start : start + _CHUNK]
+        order = sources[some]
+        made = {name: log.records[name].rows(every[some[order == at]]) for at, name in enumerate(chosen)}
+        yield Part(made, order, [])
 
 
-def _rows(name: str, table: npt.NDArray[np.void]) -> Iterator[Message]:
+def _rows(name: str, table: npt.NDArray[np.void], *, for_json: bool) -> Iterator[Message]:
     """The rows of a table as messages."""
     has_head = "frame_sequence" in (table.dtype.names or ())
     fields = fields_of(table)
-    columns = [plain(table[field]) for field in fields]
+    columns = [plain(table[field], for_json=for_json) for field in fields]
     times = table["t_us"].tolist()
     none = [None] * len(table)
     senders = [table[head].tolist() if has_head else none for head in ("system", "component", "frame_sequence")]
@@ -205,9 +297,22 @@ def fields_of(table: npt.NDArray[np.void]) -> list[str]:
     return names[len(HEAD) :] if "frame_sequence" in names else names[1:]
 
 
-def plain(column: npt.NDArray[Any]) -> list[Any]:
-    """A column as Python's own values: text up to its first zero byte, arrays as lists."""
+def plain(column: npt.NDArray[Any], *, for_json: bool = False) -> list[Any]:
+    """A column as Python's own values: text up to its first zero byte, other bytes in hexadecimal, arrays as lists.
+
+    for_json: infinities as the texts "Infinity" and "-Infinity"; what JSON is made with then writes NaN as null.
+    """
     if column.dtype.kind == "S":
         return [value.split(b"\0")[0].decode("utf-8", "replace") for value in column.tolist()]
+    if column.dtype.kind == "V":
+        return [value.hex() for value in column.tolist()]
     values: list[Any] = column.tolist()
+    if for_json and column.dtype.kind == "f" and np.isinf(column).any():
+        return [_spelled(value) for value in values]
     return values
+
+
+def _spelled(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_spelled(element) for element in value]
+    return ("Infinity" if value > 0 else "-Infinity") if math.isinf(value) else value

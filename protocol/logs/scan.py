@@ -98,6 +98,10 @@ class Scan:
         first = at + (10 if self.frames[row]["version"] == 2 else 6)
         return self.data[first : first + int(self.data[at + 1])].tobytes()
 
+    def part(self, rows: npt.NDArray[np.int64]) -> Scan:
+        """The scan of these frames only; its counters are those of the whole."""
+        return Scan(self.path, self.data, self.frames[rows], self.stamp_size, self.counters)
+
     def ends(self) -> npt.NDArray[np.int64]:
         """Where the frame of each row ends in the file."""
         ends: npt.NDArray[np.int64] = self.frames["offset"] + self.frames["length"]

@@ -16,9 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.logs.dialect import layouts, layouts_by_name
-from protocol.logs.records import IDS
+from protocol.logs.records import IDS, State, Table
 from protocol.logs.rows import count_rows, fill_rows
 from protocol.logs.scan import Scan
+from protocol.wire.codec import Layout
 
 HEAD = (("t_us", "<i8"), ("system", "u1"), ("component", "u1"), ("frame_sequence", "u1"))
 """The columns that every table of a MAVLink log begins with. No message has a field of these names (a test holds it)."""
@@ -38,14 +39,8 @@ def tables(scan: Scan, names: Collection[str] | None = None, chosen: npt.NDArray
 
     `chosen` has one truth value for each row of `scan.frames`. The tables share one piece of memory.
     """
-    wanted = {number: message for number, message in layouts().items() if names is None or message.name in names}
-    numbers = sorted(wanted)
-    slots = np.zeros(IDS, dtype=np.int32)
-    slots[numbers] = np.arange(1, len(numbers) + 1)
+    wanted, numbers, slots, counts, mask = _counted(scan, names, chosen)
     sizes = np.array([wanted[number].size for number in numbers], dtype=np.int64)
-    counts = np.zeros(len(numbers), dtype=np.int64)
-    mask = np.zeros(0, dtype=np.uint8) if chosen is None else chosen.view(np.uint8)
-    count_rows(scan.frames, mask, slots, counts)
     head = np.dtype(list(HEAD)).itemsize
     ends = np.cumsum(counts * (sizes + head))
     starts = ends - counts * (sizes + head)
@@ -56,3 +51,25 @@ def tables(scan: Scan, names: Collection[str] | None = None, chosen: npt.NDArray
         for number, start, end in zip(numbers, starts, ends, strict=True)
         if end > start
     }
+
+
+def row_counts(
+    scan: Scan, names: Collection[str] | None = None, chosen: npt.NDArray[np.bool_] | None = None
+) -> dict[str, int]:
+    """How many rows each of the tables has that `tables` gives."""
+    wanted, numbers, _, counts, _ = _counted(scan, names, chosen)
+    return {wanted[number].name: count for number, count in zip(numbers, counts.tolist(), strict=True) if count}
+
+
+def _counted(
+    scan: Scan, names: Collection[str] | None, chosen: npt.NDArray[np.bool_] | None
+) -> tuple[dict[int, Layout], list[int], Table, State, npt.NDArray[np.uint8]]:
+    """The wanted messages, their ids in order, the slot of each id, the rows of each slot, and the rows chosen."""
+    wanted = {number: message for number, message in layouts().items() if names is None or message.name in names}
+    numbers = sorted(wanted)
+    slots = np.zeros(IDS, dtype=np.int32)
+    slots[numbers] = np.arange(1, len(numbers) + 1)
+    counts = np.zeros(len(numbers), dtype=np.int64)
+    mask = np.zeros(0, dtype=np.uint8) if chosen is None else chosen.view(np.uint8)
+    count_rows(scan.frames, mask, slots, counts)
+    return wanted, numbers, slots, counts, mask

@@ -16,7 +16,7 @@ from protocol.logs.files import TELEMETRY, Log
 from protocol.logs.scan import Scan, scan_tlog
 from protocol.wire.codec import FrameWriter, layout
 from tests.protocol.logs.log_records import FOREIGN, Pen
-from tests.protocol.logs.test_files import ardupilot_log
+from tests.protocol.logs.own_logs import ardupilot_log
 
 DAY_US = 86_400_000_000
 BEGIN_US = 20_000 * DAY_US + (23 * 3600 + 59 * 60 + 58) * 1_000_000  # 23:59:58 UTC

@@ -94,14 +94,15 @@ def test_mcap_is_read_back_by_its_own_library(shell: Shell, flight_log: Path, tm
 def test_the_schema_says_types_and_units(flight_log: Path) -> None:
     from fwav_hil.logs.mcap_file import schema
 
-    made = open_log(flight_log).tables()
-    assert schema("ATT_POS_MOCAP", made["ATT_POS_MOCAP"])["properties"] == {
+    log = open_log(flight_log)
+    made = log.tables()
+    assert schema(log, "ATT_POS_MOCAP", made["ATT_POS_MOCAP"])["properties"] == {
         "time_usec": {"type": "integer", "description": "us"},
         "q": {"type": "array", "items": {"type": "number"}},
         **{axis: {"type": "number", "description": "m"} for axis in "xyz"},
         "covariance": {"type": "array", "items": {"type": "number"}},
     }
-    assert schema("STATUSTEXT", made["STATUSTEXT"])["properties"]["text"] == {"type": "string"}
+    assert schema(log, "STATUSTEXT", made["STATUSTEXT"])["properties"]["text"] == {"type": "string"}
 
 
 @pytest.mark.parametrize("kind", ["parquet", "csv", "mcap"])

@@ -13,39 +13,9 @@ from pymavlink.DFReader import DFReader_binary
 from pyulog import ULog
 
 from protocol.errors import LogError
-from protocol.logs.files import ARDUPILOT, PX4, RAW, TELEMETRY, Log, messages, open_log
+from protocol.logs.files import ARDUPILOT, ARDUPILOT_TEXT, PX4, RAW, TELEMETRY, Log, messages, open_log
 from tests.protocol.logs.log_records import mixed_records
-
-# --- ArduPilot: 0xA3 0x95 type body; FMT (128) says what each type is: type, length, name[4], format[16], labels[64].
-
-GPS_WEEK, GPS_MS = 2286, 172_800_000
-FORMATS = {
-    128: ("FMT", "BBnNZ", "Type,Length,Name,Format,Columns", "<BB4s16s64s"),
-    10: ("IMU", "QBfff", "TimeUS,I,GyrX,GyrY,GyrZ", "<QBfff"),
-    11: ("GPS", "QBIHLLe", "TimeUS,Status,GMS,GWk,Lat,Lng,Alt", "<QBIHiii"),
-    12: ("MSG", "QZ", "TimeUS,Message", "<Q64s"),
-    13: ("OLD", "Hc", "Value,Centi", "<Hh"),
-    14: ("ISBD", "Qa", "TimeUS,x", "<Q64s"),
-}
-
-
-def dataflash(number: int, *values: Any) -> bytes:
-    return b"\xa3\x95" + bytes([number]) + struct.pack(FORMATS[number][3], *values)
-
-
-def ardupilot_log() -> bytes:
-    data = b"".join(
-        dataflash(128, number, 3 + struct.calcsize(layout), name.encode(), form.encode(), columns.encode())
-        for number, (name, form, columns, layout) in FORMATS.items()
-    )
-    data += dataflash(12, 1000, b"ArduCopter V4.5.0")
-    for row in range(20):
-        data += dataflash(10, 1_000_000 + 2500 * row, row % 2, 0.1 * row, -0.5, 1e-3)
-        if row % 5 == 0:
-            data += dataflash(11, 1_001_000 + 2500 * row, 3, GPS_MS + row, GPS_WEEK, 473977411 + row, 85455927, 48809)
-            data += dataflash(13, row, -150)
-            data += dataflash(14, 1_001_500 + 2500 * row, struct.pack("<32h", *range(32)))
-    return data
+from tests.protocol.logs.own_logs import ardupilot_log, ardupilot_text_log, px4_log
 
 
 class TestArduPilot:
@@ -76,7 +46,7 @@ class TestArduPilot:
         reader.close()
         assert rows == {name: len(table) for name, table in made.items()}
         assert rows == {"FMT": 6, "IMU": 20, "GPS": 4, "MSG": 1, "OLD": 4, "ISBD": 4}
-        assert log.counters == {"damaged_bytes": 0}
+        assert not any(log.counters.values())
 
     def test_scaled_fields_are_what_they_stand_for(self, log: Log) -> None:
         made = log.tables(["GPS", "OLD"])
@@ -93,35 +63,13 @@ class TestArduPilot:
         (tmp_path / "1.BIN").write_bytes(data[:at] + b"noise" + data[at:-2])
         log = open_log(tmp_path / "1.BIN")
         assert len(log.tables()["IMU"]) == 19
-        assert log.counters["damaged_bytes"] == 5 + 3 + struct.calcsize("<QBfff") - 2
+        assert log.counters["damaged_bytes"] == 5
+        assert log.counters["truncated_tail"] == 3 + struct.calcsize("<QBfff") - 2
 
     def test_what_only_begins_like_one_is_an_error(self, tmp_path: Path) -> None:
         (tmp_path / "1.BIN").write_bytes(b"\xa3\x95" + bytes(100))
         with pytest.raises(LogError, match=r"1\.BIN"):
             open_log(tmp_path / "1.BIN")
-
-
-# --- PX4: header, then messages of size (u16), type and body: F format, A subscription, D data, O dropout.
-
-
-def ulog_message(kind: str, body: bytes) -> bytes:
-    return struct.pack("<HB", len(body), ord(kind)) + body
-
-
-def px4_log() -> bytes:
-    data = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 500)
-    data += ulog_message("B", bytes(40))
-    data += ulog_message("F", b"pose:uint64_t timestamp;float[4] q;float x;uint8_t count;uint8_t[3] _padding0;")
-    data += ulog_message("F", b"mode:uint64_t timestamp;bool armed;")
-    for number, (instance, name) in enumerate([(0, b"pose"), (1, b"pose"), (0, b"mode")]):
-        data += ulog_message("A", struct.pack("<BH", instance, number) + name)
-    for row in range(10):
-        for number in (0, 1):
-            body = struct.pack("<HQfffffB", number, 1000 + 4000 * row, 1, 0, 0, row, 0.5 * row, number)
-            data += ulog_message("D", body)
-        if row % 5 == 0:
-            data += ulog_message("D", struct.pack("<HQB", 2, 1001 + 4000 * row, row > 0))
-    return data + ulog_message("O", struct.pack("<H", 20))
 
 
 class TestPx4:
@@ -133,18 +81,23 @@ class TestPx4:
     def test_every_value_is_pyulogs(self, log: Log) -> None:
         assert log.kind == PX4
         made = log.tables()
-        assert {name: len(table) for name, table in made.items()} == {"mode": 2, "pose": 10, "pose_1": 10}
         for topic in ULog(io.BytesIO(px4_log())).data_list:
             table = made[topic.name if not topic.multi_id else f"{topic.name}_{topic.multi_id}"]
+            assert len(table) == len(topic.data["timestamp"])
             for field, values in topic.data.items():
-                ours = table["q"][:, int(field[2])] if field.startswith("q[") else table[field]
+                if "name" in field:  # characters, which pyulog gives one by one
+                    name, at = field[: field.rindex("[")], int(field[field.rindex("[") + 1 : -1])
+                    ours: Any = [bytes(value).ljust(4, b"\0")[at] for value in table[name]]
+                else:
+                    ours = table["q"][:, int(field[2])] if field.startswith("q[") else table[field]
                 np.testing.assert_array_equal(ours, values)
             np.testing.assert_array_equal(table["t_us"], topic.data["timestamp"])
         assert made["pose"]["q"].shape == (10, 4)
         assert made["pose"]["q"][:, 3].tolist() == list(range(10))
 
     def test_dropouts_are_counted(self, log: Log) -> None:
-        assert log.counters == {"dropouts": 1, "damaged": 0}
+        assert {name: count for name, count in log.counters.items() if count} == {"dropouts": 1}
+        assert log.tables()["dropouts"]["duration_ms"].tolist() == [20]
 
     def test_what_only_begins_like_one_is_an_error(self, tmp_path: Path) -> None:
         (tmp_path / "1.ulg").write_bytes(px4_log()[:10])
@@ -153,11 +106,12 @@ class TestPx4:
 
 
 class TestAnyKind:
-    @pytest.fixture(params=["tlog", "BIN", "ulg"])
+    @pytest.fixture(params=["tlog", "BIN", "log", "ulg"])
     def log(self, request: pytest.FixtureRequest, tmp_path: Path) -> Log:
         data = {
             "tlog": b"".join(record.data for record in mixed_records()),
             "BIN": ardupilot_log(),
+            "log": ardupilot_text_log(),
             "ulg": px4_log(),
         }[request.param]
         (tmp_path / f"1.{request.param}").write_bytes(data)
@@ -174,7 +128,8 @@ class TestAnyKind:
             last = message.t_us
             for name, value in message.fields.items():
                 if isinstance(value, str):
-                    assert value == bytes(row[name]).split(b"\0")[0].decode("utf-8", "replace")
+                    text = row[name] if isinstance(row[name], str) else bytes(row[name]).split(b"\0")[0]
+                    assert value == (text if isinstance(text, str) else text.decode("utf-8", "replace"))
                 else:
                     assert np.array_equal(value, row[name], equal_nan=row[name].dtype.kind == "f")
         assert rows == {name: len(table) for name, table in made.items()}
@@ -196,6 +151,7 @@ def test_the_kind_is_told_from_the_content_not_the_name(tmp_path: Path) -> None:
         (b"".join(record.frame for record in mixed_records()), RAW),
         (ardupilot_log(), ARDUPILOT),
         (px4_log(), PX4),
+        (ardupilot_text_log(), ARDUPILOT_TEXT),
     ):
         (tmp_path / "log").write_bytes(data)
         assert open_log(tmp_path / "log").kind == kind
