@@ -1,6 +1,7 @@
 """The motor bus of a run, recorded in a format that python-can reads back: .blf, .log (candump), .asc, .csv by suffix.
 
 Stamps are the run's own time: simulation time in lockstep and real time alike, so that the log lies beside the tlog.
+candump's .log has them 1 s later: can-utils' log2asc takes second 0 for no time at all.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from protocol.scenario import NANOSECONDS
 
 SUFFIXES: Final = (".blf", ".log", ".asc", ".csv")
 CHANNEL: Final = "motors"
+CANDUMP_START_NS: Final = NANOSECONDS
+"""The stamp of t = 0 in candump's .log."""
 
 
 def check_record(path: Path) -> None:
@@ -36,6 +39,7 @@ class CanRecorder:
     def __init__(self, path: Path, tell: Callable[[str], None] | None = None) -> None:
         check_record(path)
         self.path = path
+        self._start_ns = CANDUMP_START_NS if path.suffix.lower() == ".log" else 0
         self._tell = tell
         self._is_full = False
         self._owed: list[tuple[int, CanFrame]] = []
@@ -55,7 +59,7 @@ class CanRecorder:
             for t_ns, frame in self._owed:
                 self._writer.on_message_received(
                     can.Message(
-                        timestamp=t_ns / NANOSECONDS,
+                        timestamp=(self._start_ns + t_ns) / NANOSECONDS,
                         arbitration_id=frame.can_id,
                         data=frame.data,
                         is_extended_id=frame.extended,

@@ -22,14 +22,20 @@ LATEST_LOOK_NS = 80_000_000
 LARGEST_MOMENT = 64
 """Most frames of one stamp that are made ready together."""
 
+_DAY_NS = 86_400_000_000_000
+_LATEST_US = 1 << 52
+"""The longest log (142 years): more would not fit in ns, so several jumps of a clock by decades are cut."""
+
 Times = npt.NDArray[np.int64]
 
 
 def log_times_ns(stamps_us: Times, max_gap_s: float | None = None) -> Times:
     """Log time (n,) of each frame since the first, ns: gaps beyond max_gap_s are shortened to it, steps back count as none."""
-    steps_ns = np.diff(stamps_us, prepend=stamps_us[:1]) * 1000
-    most = np.iinfo(np.int64).max if max_gap_s is None else round(max_gap_s * 1e9)
-    times: Times = np.cumsum(np.clip(steps_ns, 0, most))
+    steps_ns = np.clip(np.diff(stamps_us, prepend=stamps_us[:1]), 0, _LATEST_US) * 1000
+    if max_gap_s is not None:
+        steps_ns = np.minimum(steps_ns, round(max_gap_s * 1e9))
+    jumps = int(np.count_nonzero(steps_ns > _DAY_NS))
+    times: Times = np.cumsum(np.minimum(steps_ns, 1000 * _LATEST_US // max(1, jumps)))
     return times
 
 

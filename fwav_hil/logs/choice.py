@@ -141,6 +141,14 @@ def time_of_day(stamp_us: int) -> str:
     return f"{tenths // 36_000:02d}:{tenths // 600 % 60:02d}:{tenths // 10 % 60:02d}.{tenths % 10}"
 
 
+def duration(t_s: float) -> str:
+    """A time in the unit in which one thinks of it."""
+    for unit, size in (("years", 31_557_600.0), ("days", 86_400.0), ("hours", 3600.0)):
+        if t_s >= 2.0 * size:
+            return f"{t_s / size:.1f} {unit}"
+    return f"{t_s:.1f} s"
+
+
 def _sender(text: str) -> Sender:
     if (found := _SENDER.fullmatch(text)) and all(int(part) < 256 for part in found.groups(default="0")):
         return int(found[1]), int(found[2]) if found[2] else None

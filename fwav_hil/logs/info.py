@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bridge.recording.sidecar import link_numbers, read_sidecar
+from fwav_hil.logs.choice import duration
 from fwav_hil.tables import plain_console
 from protocol.errors import RunFolderError
 from protocol.logs.dialect import layouts
@@ -22,6 +23,7 @@ GAP = 3.0
 """An interval longer than this many times the usual (median) one is a gap."""
 
 PLACES_SHOWN = 20
+_JUMP_AHEAD_US, _JUMP_BACK_US = 86_400_000_000, 60_000_000
 _WIDTH_ELSEWHERE = 120
 """Columns where there is no terminal: no name is cut off."""
 _SHOWN_INFORMATION = ("sys_name", "ver_hw", "ver_sw", "ver_sw_branch", "replay")
@@ -31,9 +33,10 @@ _YEAR_2000_S = 946_684_800.0
 def log_info(log: Log) -> dict[str, Any]:
     """All that `log info` says, as plain values; times in seconds.
 
-    kind, bytes, start_s (of the first record), duration_s, messages, rate_hz; systems (MAVLink logs: system, component,
-    messages, lost, out_of_order, versions, signed); types (name, system, component, count, rate_hz, interval_s: the median,
-    gaps, longest_gap_s); recording (of a log of this project, by its sidecar: complete, lost, error, stamps, links: uri, peer,
+    kind, bytes, start_s (of the first record), duration_s, clock_jumps (after_s and by_s of each step of the stamps by more
+    than a day, or a minute back), messages, rate_hz; systems (MAVLink logs: system, component, messages, lost,
+    out_of_order, versions, signed); types (name, system, component, count, rate_hz, interval_s: the median, gaps,
+    longest_gap_s); recording (of a log of this project, by its sidecar: complete, lost, error, stamps, links: uri, peer,
     sent and received frames); content (of a PX4 log: how many topics, logged_messages, parameters and so on, and its
     information by key); damage (counters, and places: offset and bytes of the first stretches of damage).
     """
@@ -46,6 +49,7 @@ def log_info(log: Log) -> dict[str, Any]:
         "bytes": log.path.stat().st_size,
         "start_s": first / 1e6,
         "duration_s": duration_s,
+        "clock_jumps": _clock_jumps(log.scan) if log.scan is not None else [],
         "messages": count,
         "rate_hz": (count - 1) / duration_s if duration_s > 0 else None,
         "systems": _systems(log.scan) if log.scan is not None else [],
@@ -134,6 +138,14 @@ def _pace(stamps_us: npt.NDArray[np.int64]) -> dict[str, Any]:
     }
 
 
+def _clock_jumps(scan: Scan) -> list[dict[str, float]]:
+    """Where the clock of the computer that recorded was set: seconds since the log began, and by how many it jumped."""
+    stamps = scan.frames["stamp_us"]
+    steps = np.diff(stamps)
+    where = np.flatnonzero((steps > _JUMP_AHEAD_US) | (steps < -_JUMP_BACK_US))[:PLACES_SHOWN]
+    return [{"after_s": float(stamps[at] - stamps[0]) / 1e6, "by_s": float(steps[at]) / 1e6} for at in where]
+
+
 def _places(scan: Scan) -> list[dict[str, int]]:
     """The first stretches of bytes between records that belong to none."""
     begins = scan.frames["offset"].astype(np.int64) - scan.stamp_size
@@ -152,6 +164,9 @@ def print_info(info: dict[str, Any], *, to_stderr: bool = False) -> None:
     console.print(
         f"{info['messages']} messages in {info['duration_s']:.3f} s{rate}, from {_moment(info['start_s'])} on"
     )
+    for jump in info["clock_jumps"]:
+        way = "ahead" if jump["by_s"] > 0 else "back"
+        console.print(f"the log's clock jumps {way} by {duration(abs(jump['by_s']))} after {jump['after_s']:.3f} s")
     if info["recording"]:
         _print_recording(console, info["recording"])
     if info["content"]:

@@ -19,7 +19,7 @@ from bridge.reporting import Report
 from bridge.summary import percentiles_us
 from bridge.timing.clock import Clock, PunctualClock, unix_time_us
 from bridge.timing.realtime import Settings, maybe_real_time, own_core, report_settings
-from fwav_hil.logs.choice import time_of_day
+from fwav_hil.logs.choice import duration, time_of_day
 from fwav_hil.progress import StatusLine
 from fwav_hil.replay.keyboard import HELP, Keyboard
 from fwav_hil.replay.options import ReplayOptions
@@ -31,6 +31,9 @@ from protocol.wire.signing import Signatures
 
 _DRAIN_LIMIT = 100
 _DRAW_PERIOD_NS = 200_000_000
+_LONG_WAIT_S = 10.0
+"""A silence that makes the replay wait longer than this is told of before it begins."""
+_STEP_BACK_US = 60_000_000
 _DRAW_ROOM_NS = 3_000_000
 """Drawing the bar takes a millisecond or two: it waits for a moment when nothing is due, at most five periods."""
 
@@ -115,6 +118,8 @@ class Replay:
                     f"{self._were_signed} frames carry the signatures of their day, which a receiver that checks them "
                     "refuses: sign anew with --signing-key FILE"
                 )
+            for sentence in self.waits():
+                self._display.say(sentence)
             begun_ns = self._clock.now_ns()
             self.player.play(loop=self._options.loop)
             wall_ns = self._clock.now_ns() - begun_ns
@@ -126,6 +131,28 @@ class Replay:
                 "receiver first, or correct the address"
             )
         return result
+
+    def waits(self) -> list[str]:
+        """What is to be said beforehand of the log's clock: silences that the replay will wait through, steps back."""
+        said, steps_us = [], np.diff(self._stamps_us)
+        back = np.flatnonzero(steps_us < -_STEP_BACK_US)
+        if len(back):
+            said.append(
+                f"the log's clock goes back by {duration(-1e-6 * float(steps_us[back[0]]))} behind frame {back[0] + 1}"
+                + (f" (and at {len(back) - 1} more places)" if len(back) > 1 else "")
+                + ": the replay goes on there without waiting"
+            )
+        steps_ns = np.diff(self.player.times_ns)
+        silent = np.flatnonzero(steps_ns > _LONG_WAIT_S * 1e9 * (self._options.speed or np.inf))
+        if len(silent):
+            longest = silent[np.argmax(steps_ns[silent])]
+            wait_s = 1e-9 * float(steps_ns[longest]) / (self._options.speed or 1.0)
+            said.append(
+                f"the log is silent for {duration(1e-9 * float(steps_ns[longest]))} behind frame {longest + 1}"
+                + (f" (the longest of {len(silent)} silences)" if len(silent) > 1 else "")
+                + f", through which the replay waits for {duration(wait_s)}: --max-gap 1 makes a second of each"
+            )
+        return said
 
     @property
     def _refused(self) -> int:

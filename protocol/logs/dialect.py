@@ -12,6 +12,11 @@ from pymavlink.dialects.v20 import all as widest
 
 from protocol.wire.codec import Layout
 
+BINARY = frozenset(
+    {("PARAM_EXT_VALUE", "param_value"), ("PARAM_EXT_SET", "param_value"), ("PARAM_EXT_ACK", "param_value")}
+)
+"""Fields that are characters by their definition and hold bytes: here, a value of the kind that param_type says."""
+
 
 @functools.cache
 def layouts() -> Mapping[int, Layout]:

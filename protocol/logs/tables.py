@@ -15,7 +15,7 @@ from collections.abc import Collection
 import numpy as np
 import numpy.typing as npt
 
-from protocol.logs.dialect import layouts, layouts_by_name
+from protocol.logs.dialect import BINARY, layouts, layouts_by_name
 from protocol.logs.records import IDS, State, Table
 from protocol.logs.rows import count_rows, fill_rows
 from protocol.logs.scan import Scan
@@ -31,7 +31,11 @@ Tables = dict[str, npt.NDArray[np.void]]
 def table_dtype(name: str) -> np.dtype[np.void]:
     """Row of the table of a message. Raises KeyError where the dialect has none of that name."""
     fields = layouts_by_name()[name].dtype
-    return np.dtype([*HEAD, *((field, fields[field]) for field in fields.names or ())])
+    kinds = (
+        (field, f"V{fields[field].itemsize}" if (name, field) in BINARY else fields[field])
+        for field in fields.names or ()
+    )
+    return np.dtype([*HEAD, *kinds])
 
 
 def tables(scan: Scan, names: Collection[str] | None = None, chosen: npt.NDArray[np.bool_] | None = None) -> Tables:

@@ -41,3 +41,14 @@ def test_or_is_told_once_and_what_was_written_can_be_read(tmp_path: Path) -> Non
     (tmp_path / "bus.log").write_text(whole)
     with can.LogReader(tmp_path / "bus.log") as reader:
         assert len(list(reader)) > 300
+
+
+@pytest.mark.parametrize(("suffix", "start_s"), [(".log", 1.0), (".blf", 0.0), (".asc", 0.0), (".csv", 0.0)])
+def test_stamps_are_the_runs_time_and_none_of_candumps_is_in_second_zero(
+    tmp_path: Path, suffix: str, start_s: float
+) -> None:
+    fill(CanRecorder(tmp_path / f"bus{suffix}"))
+    with can.LogReader(tmp_path / f"bus{suffix}") as reader:
+        stamps = [message.timestamp for message in reader]
+    first = stamps[0] if suffix in (".blf", ".asc") else 0.0  # these may count from the date of the file
+    assert [stamp - first for stamp in stamps] == pytest.approx([start_s + 1e-3 * row for row in range(2000)], abs=2e-6)

@@ -213,3 +213,10 @@ class TestHand:
         span_ns = int(TICKS_NS[-1])
         for number, t_ns in enumerate(stage.times_ns()[:300]):
             assert t_ns == number // 100 * span_ns + 4 * MS * (number % 100)
+
+
+def test_many_jumps_of_a_clock_leave_times_in_order() -> None:
+    stamps_us = np.array([0, 1 << 51, 0, 1 << 51, 5, (1 << 52) - 1, 7, 1 << 51], dtype=np.int64)
+    times = log_times_ns(stamps_us)
+    assert (np.diff(times) >= 0).all()
+    assert log_times_ns(stamps_us, 2.0).tolist() == [0, 2e9, 2e9, 4e9, 4e9, 6e9, 6e9, 8e9]

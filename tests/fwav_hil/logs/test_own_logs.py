@@ -1,9 +1,10 @@
-"""Logs that autopilots wrote of themselves, by the commands: shown, dumped, plotted, exported without loss."""
+"""Logs of others, by the commands: shown, dumped, plotted, exported without loss."""
 
 from __future__ import annotations
 
 import csv
 import json
+import struct
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -63,6 +64,48 @@ def test_bytes_stay_bytes_in_every_export(shell: Shell, tmp_path: Path) -> None:
     with (tmp_path / "in.mcap").open("rb") as file:
         found = [message for _, channel, message in make_reader(file).iter_messages() if channel.topic == "/FILE"]
     assert json.loads(found[0].data)["Data"] == FILE_BYTES
+
+
+def test_values_of_extended_parameters_keep_their_bytes(shell: Shell, tmp_path: Path) -> None:
+    log = case("param-ext-binary/in.tlog")
+    for kind in ("csv", "parquet", "mcap"):
+        assert shell("export", log, "--to", kind).code == 0
+    wanted = [struct.pack("<I", 0x100), struct.pack("<f", 1.5), struct.pack("<Q", (1 << 63) + 1), b"text"]
+    dumped = [json.loads(line)["fields"]["param_value"] for line in shell("dump", log, "--json").out.splitlines()]
+    with (tmp_path / "in.mcap").open("rb") as file:
+        in_mcap = [json.loads(message.data)["param_value"] for _, _, message in make_reader(file).iter_messages()]
+    with (tmp_path / "in_csv" / "PARAM_EXT_VALUE.csv").open() as opened:
+        in_csv = [row["param_value"] for row in csv.DictReader(opened)]
+    in_parquet = pq.read_table(tmp_path / "in_parquet" / "PARAM_EXT_VALUE.parquet")["param_value"].to_pylist()
+    for found in (dumped, in_mcap, in_csv, [value.hex() for value in in_parquet]):
+        assert [bytes.fromhex(text) for text in found] == [value.ljust(128, b"\0") for value in wanted]
+
+
+def test_infinity_is_told_from_nan_in_json(shell: Shell, tmp_path: Path) -> None:
+    log = case("json-infinity/in.tlog")
+    lines = shell("dump", log, "--json").out.splitlines()
+    values = [value for line in lines for value in json.loads(line)["fields"].values()]
+    assert "Infinity" in values
+    assert "-Infinity" in values
+    assert None in values
+    assert shell("export", log, "--to", "mcap").code == 0
+    with (tmp_path / "in.mcap").open("rb") as file:
+        bodies = [
+            json.loads(message.data, parse_constant=pytest.fail) for _, _, message in make_reader(file).iter_messages()
+        ]
+    assert bodies == [json.loads(line)["fields"] for line in lines]
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet", "mcap"])
+def test_frames_of_unknown_messages_are_counted_in_each_export(shell: Shell, mixed_log: Path, kind: str) -> None:
+    ended = shell("export", mixed_log, "--to", kind, "--json", "-")
+    assert json.loads(ended.out)["unknown_frames"] == 30
+    assert ended.err.endswith("; left out: 30 frames of unknown messages\n")
+
+
+def test_info_tells_of_a_clock_that_was_set(shell: Shell) -> None:
+    ended = shell("info", case("replay-clock-jump/in.tlog"))
+    assert "the log's clock jumps ahead by 53.9 years after 1.980 s" in ended.out
 
 
 def test_what_a_record_lacks_is_empty_in_every_export(shell: Shell, tmp_path: Path) -> None:

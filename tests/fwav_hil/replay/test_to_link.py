@@ -27,6 +27,7 @@ from fwav_hil.replay.to_link import Replay
 from protocol.logs.tlog import read_tlog
 from protocol.wire import mapping
 from protocol.wire.codec import FrameReader
+from tests.cases import case
 from tests.fwav_hil.replay.conftest import Command
 from tests.protocol.logs.log_records import CLASHING, FOREIGN, Pen
 
@@ -306,3 +307,38 @@ class _Player:
 
     def __getattr__(self, name: str) -> Any:
         return lambda *values: self.calls.append(" ".join([name, *map(str, values)]))
+
+
+class TestWaits:
+    """What is said of the log's clock before the first frame goes."""
+
+    @staticmethod
+    def said(log: Path, **options: Any) -> list[str]:
+        opened, scan = open_telemetry(log)
+        near, _ = memory_pair()
+        how = ReplayOptions(**options)
+        return Replay(scan, choose_frames(opened, scan, Choice()), near, how, VirtualClock(0), StopFlag()).waits()
+
+    def test_a_clock_that_was_set_meanwhile(self) -> None:
+        log = case("replay-clock-jump/in.tlog")
+        (sentence,) = self.said(log)
+        assert sentence == (
+            "the log is silent for 53.9 years behind frame 100, through which the replay waits for 53.9 years: "
+            "--max-gap 1 makes a second of each"
+        )
+        assert "waits for 196.8 days" in self.said(log, speed=100.0)[0]
+        assert self.said(log, max_gap_s=1.0) == []
+        assert self.said(log, speed=None) == []
+
+    def test_a_clock_that_was_set_back(self, tmp_path: Path) -> None:
+        pen = Pen()
+        records = [pen.record(0) for _ in range(20)]
+        moved = [record._replace(t_us=record.t_us - 10_800_000_000) for record in records[10:]]
+        (tmp_path / "a.tlog").write_bytes(b"".join(record.data for record in [*records[:10], *moved]))
+        (sentence,) = self.said(tmp_path / "a.tlog")
+        assert sentence.startswith("the log's clock goes back by 3.0 hours behind frame 10: ")
+
+    def test_nothing_is_said_of_a_log_without_jumps(self, tmp_path: Path) -> None:
+        pen = Pen()
+        (tmp_path / "a.tlog").write_bytes(b"".join(pen.record(0, step_us=9_000_000).data for _ in range(20)))
+        assert self.said(tmp_path / "a.tlog") == []
