@@ -16,7 +16,7 @@ from bridge.recording.sidecar import LinkOfLog
 from bridge.recording.thread_recorder import Recorder, refuse_existing_log
 from bridge.timing.clock import MonotonicClock, unix_time_us
 from fwav_hil.progress import StatusLine
-from protocol.wire.codec import FrameReader, layouts_by_id
+from protocol.logs.keeping import FrameKeeper
 
 LOOK_PERIOD_S = 0.1
 _RATE_PERIOD_S = 0.5
@@ -25,7 +25,7 @@ _RATE_PERIOD_S = 0.5
 class Listener:
     """One link, heard in a thread of its own; every frame goes to the recorder under the time at which it arrived.
 
-    frames, kinds, peers   how many came, how many of each message id, and who was heard
+    frames, kinds, peers   how many came, how many of each message, and who was heard
     """
 
     def __init__(self, number: int, link: Link, recorder: Recorder) -> None:
@@ -33,10 +33,10 @@ class Listener:
         self.link = link
         self.ending = False
         self.frames = 0
-        self.kinds: Counter[int] = Counter()
+        self.kinds: Counter[str] = Counter()
         self.peers: set[str] = set()
         self._recorder = recorder
-        self._reader = FrameReader(is_datagram=link.is_datagram, keep_mavlink1=True)
+        self._reader = FrameKeeper(is_datagram=link.is_datagram)
 
     def run(self) -> None:
         """Listen until told to end. Raises LinkError, and RunFolderError where the recorder does."""
@@ -51,12 +51,13 @@ class Listener:
                 self.link.release_peer()  # whoever else sends here is recorded too, an empty datagram or not
             for frame in self._reader.read(data):
                 self._recorder.write(t_us, frame.raw, self.number)
-                self.kinds[frame.message_id] += 1
+                self.kinds[frame.name] += 1
                 self.frames += 1
 
     def counters(self) -> dict[str, int]:
         """What the link and the reader have counted, by name."""
-        return {**self.link.stats.as_dict(), **self._reader.counters}
+        dropped = {"dropped_by_system": self.link.dropped_by_system()}
+        return {**self.link.stats.as_dict(), **self._reader.counters, **dropped}
 
 
 def record(
@@ -85,9 +86,17 @@ def record(
         try:
             wall_s = _listen(listeners, stop, duration_s)
         finally:
+            dropped = 0
             for listener in listeners:
-                recorder.sidecar["counters"][str(listener.number)] = listener.counters()
+                counters = listener.counters()
+                dropped += counters["dropped_by_system"]
+                recorder.sidecar["counters"][str(listener.number)] = counters
                 recorder.sidecar["links"][listener.number]["peer"] = ", ".join(sorted(listener.peers - {NOBODY}))
+            if dropped:
+                recorder.lost += dropped
+                recorder.sidecar["error"] = (
+                    f"the system dropped {dropped} datagrams, which came faster than they were read"
+                )
     return {
         "log": str(log),
         "links": recorder.sidecar["links"],
@@ -96,7 +105,8 @@ def record(
         "frames_per_s": recorder.sidecar["frames"] / wall_s,
         "bytes": recorder.sidecar["bytes"],
         "lost": recorder.lost,
-        "messages": _by_name(sum((listener.kinds for listener in listeners), Counter())),
+        "error": recorder.sidecar["error"],
+        "messages": dict(sum((listener.kinds for listener in listeners), Counter[str]()).most_common()),
         "counters": recorder.sidecar["counters"],
     }
 
@@ -128,11 +138,6 @@ def _listen(listeners: list[Listener], stop: StopFlag, duration_s: float | None)
     for task in tasks:
         task.result()
     return (clock.now_ns() - begun_ns) * 1e-9
-
-
-def _by_name(kinds: Counter[int]) -> dict[str, int]:
-    known = layouts_by_id()
-    return {known[kind].name if kind in known else f"UNKNOWN_{kind}": count for kind, count in kinds.most_common()}
 
 
 def _say(text: str) -> None:

@@ -35,7 +35,8 @@ def record_command(
 ) -> None:  # fmt: skip
     """Record every frame of live links, with a sidecar that says which link each came by.
 
-    Nothing is sent. Frames of unknown messages and of MAVLink 1 are kept. Ctrl-C ends the recording (exit code 0). Exit code
+    Nothing is sent. Every intact frame is kept, of MAVLink 1 and 2 and of whatever message; what the system dropped since it
+    was not read in time is told, and counted as lost. Ctrl-C ends the recording (exit code 0). Exit code
     4: nothing came.
     """
     from bridge.process import StopFlag
@@ -47,8 +48,13 @@ def record_command(
     stop.install()
     log = out or Path(f"recording-{local_stamp()}.tlog")
     result = record(links, log, stop, duration_s=duration_s, wait_s=wait_s, goes_on=on_log_error == "continue")
-    lost = f", {result['lost']} lost" if result["lost"] else ""
-    click.echo(f"{log}: {result['frames']} frames in {result['duration_s']:.1f} s{lost}", err=is_stdout(json_path))
+    lost = f", {result['lost']} lost ({result['error']})" if result["lost"] else ""
+    counted = result["counters"].values()
+    damaged = sum(link["bad_crc"] + link["truncated"] for link in counted)
+    left_out = f"; left out: {damaged} damaged frames" if damaged else ""
+    click.echo(
+        f"{log}: {result['frames']} frames in {result['duration_s']:.1f} s{lost}{left_out}", err=is_stdout(json_path)
+    )
     show_json(json_path, result)
     if not result["frames"]:
         raise PeerMissingError(f"no frame came over {', '.join(links)}: see that something sends there")

@@ -119,6 +119,13 @@ class Link(abc.ABC):
         """
         return False
 
+    def dropped_by_system(self) -> int:
+        """Datagrams that the system dropped since the link was opened, because they were not received in time.
+
+        0 where nothing can be dropped so (a stream), or the system does not say.
+        """
+        return 0
+
     def counters(self) -> dict[str, int]:
         """What the link has counted, by name."""
         return self.stats.as_dict()

@@ -18,10 +18,12 @@ from __future__ import annotations
 
 import abc
 import contextlib
+import os
 import select
 import socket
 import struct
 import sys
+from pathlib import Path
 from typing import Final
 
 from bridge.links.addresses import Address, cannot_bind, name_of, new_socket, resolve
@@ -32,6 +34,9 @@ from protocol.errors import LinkClosedError, LinkError
 LARGEST_DATAGRAM_BYTES: Final = 65535
 WANTED_BUFFER_BYTES: Final = 1 << 20
 
+_SOCKETS = ("/proc/net/udp", "/proc/net/udp6")
+_INODE = 9
+"""The field of a line there that tells the socket; the last one is what was dropped."""
 _BLOCKING_WAIT_S = 0.008
 _ONE_JIFFY = struct.pack("@ll", 0, 1000)  # struct timeval of 1 ms; the kernel rounds up to a jiffy
 _SO_TIMESTAMPNS = 35  # as option and as type of the control message; not among Python's names
@@ -116,6 +121,16 @@ class _UdpLink(Link):
             select.select((self._socket,), (), (), timeout_s)
         except (OSError, ValueError) as error:  # closed by another thread
             raise self._broken(error) from error
+
+    def dropped_by_system(self) -> int:
+        """What Linux says of the socket in /proc/net; see `Link.dropped_by_system`."""
+        try:
+            inode = str(os.fstat(self._socket.fileno()).st_ino)
+            tables = [Path(name).read_text(encoding="ascii") for name in _SOCKETS if Path(name).exists()]
+        except OSError:  # closed, or not Linux
+            return 0
+        lines = [line.split() for table in tables for line in table.splitlines()]
+        return next((int(fields[-1]) for fields in lines if len(fields) > _INODE and fields[_INODE] == inode), 0)
 
     def close(self) -> None:
         """Let go of the port."""

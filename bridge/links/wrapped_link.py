@@ -35,6 +35,10 @@ class WrappedLink(Link):
         """As the link does."""
         return self._link.stamp_receives()
 
+    def dropped_by_system(self) -> int:
+        """The link's."""
+        return self._link.dropped_by_system()
+
     def close(self) -> None:
         """Close the link; what is on its way is lost."""
         self._closed = True

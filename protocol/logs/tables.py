@@ -16,10 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.logs.dialect import BINARY, layouts, layouts_by_name
-from protocol.logs.records import IDS, State, Table
+from protocol.logs.records import IDS, State
 from protocol.logs.rows import count_rows, fill_rows
 from protocol.logs.scan import Scan
 from protocol.wire.codec import Layout
+from protocol.wire.framing import Table
 
 HEAD = (("t_us", "<i8"), ("system", "u1"), ("component", "u1"), ("frame_sequence", "u1"))
 """The columns that every table of a MAVLink log begins with. No message has a field of these names (a test holds it)."""

@@ -23,6 +23,7 @@ from fwav_hil.record import record
 from protocol.errors import LinkError, PeerMissingError, RunFolderError
 from protocol.logs.scan import scan_tlog
 from tests.bridge.recording.test_thread_recorder import numbered, wait_until
+from tests.cases import case
 from tests.disk import small_disk
 from tests.fwav_hil.replay.conftest import Command, fwav_hil
 
@@ -140,6 +141,39 @@ class TestFrames:
         assert running.result["messages"] == {"HEARTBEAT": 2, "ATTITUDE": 2, "UNKNOWN_8388607": 1}
         counters = read_sidecar(log)["counters"]["0"]
         assert (counters["bad_crc"], counters["mavlink1"], counters["unknown_message"]) == (1, 2, 1)
+
+    @pytest.mark.parametrize("name", ["in", "unknown"])
+    @pytest.mark.parametrize("stream", [False, True])
+    def test_every_intact_frame_is_kept_whatever_its_message(self, tmp_path: Path, name: str, stream: bool) -> None:
+        scan = scan_tlog(case(f"record-mavlink1-ardupilot/{name}.tlog"))
+        frames, log = [scan.raw(row) for row in range(len(scan))], tmp_path / "a.tlog"
+        assert len(frames) == {"in": 40, "unknown": 110}[name]
+        if stream:
+            with (
+                socket.create_server(("127.0.0.1", 0)) as server,
+                recording(f"tcpout://127.0.0.1:{server.getsockname()[1]}", log=log) as running,
+            ):
+                client, _ = server.accept()
+                with client:
+                    client.sendall(b"".join(frames))
+                    wait_until(lambda: running.has(len(frames)))
+        else:
+            port = free_port()
+            with recording(f"udpin://127.0.0.1:{port}", log=log) as running:
+                send_until(lambda: running.has(len(frames)), port, frames)
+        kept = scan_tlog(log)
+        assert [kept.raw(row) for row in range(len(kept))] == frames
+        assert read_sidecar(log)["lost"] == 0
+
+    def test_what_the_system_drops_is_said(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fwav_hil: Command, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        monkeypatch.setattr("bridge.links.udp._UdpLink.dropped_by_system", lambda _: 7)
+        assert fwav_hil("record", "--link", "udpin://127.0.0.1:0", "--out", "a.tlog", "--duration", "0.1") == 4
+        said = "the system dropped 7 datagrams, which came faster than they were read"
+        assert f"a.tlog: 0 frames in 0.1 s, 7 lost ({said})" in capsys.readouterr().out
+        content = read_sidecar(tmp_path / "a.tlog")
+        assert (content["complete"], content["lost"], content["error"]) == (False, 7, said)
 
     def test_two_links_in_one_log_are_told_apart(self, tmp_path: Path) -> None:
         ports, log = (free_port(), free_port()), tmp_path / "a.tlog"

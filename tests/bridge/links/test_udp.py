@@ -377,3 +377,18 @@ class TestStamps:
     def test_elsewhere_they_are_not_asked_for(self, out_end: UdpOut, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(sys, "platform", "darwin")
         assert not out_end.stamp_receives()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux says what it dropped")
+def test_what_the_system_dropped_is_known() -> None:
+    with open_link("udpin://127.0.0.1:0") as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        assert link.dropped_by_system() == 0
+        address = ("127.0.0.1", int(link.uri.rpartition(":")[2]))
+        sent = 2000
+        for _ in range(sent):
+            sender.sendto(bytes(4000), address)
+        dropped = link.dropped_by_system()
+        received = sum(1 for _ in iter(lambda: link.recv(0.0), None))
+        assert received + dropped == sent
+        assert dropped > 0
+    assert link.dropped_by_system() == 0  # closed
