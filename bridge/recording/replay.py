@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -42,7 +43,7 @@ def log_times_ns(stamps_us: Times, max_gap_s: float | None = None) -> Times:
 class Player:
     """Plays frames 0 .. n - 1 by their log times (n,), ns.
 
-    prepare    gives the bytes of a frame in a pass (both from 0), ahead of its moment; send takes them at it
+    prepare    gives a frame in a pass (both from 0) as what `send` takes, ahead of its moment; send takes it at it
     look       called first, and then some fifty times a second, between frames and also while it is held: may call `hold`,
                `step`, `seek`, `stop`
     speed      of log time against time; None: as fast as it goes
@@ -55,8 +56,8 @@ class Player:
     def __init__(
         self,
         times_ns: Times,
-        prepare: Callable[[int, int], bytes],
-        send: Callable[[bytes], None],
+        prepare: Callable[[int, int], Any],
+        send: Callable[[Any], None],
         clock: Clock,
         *,
         speed: float | None,
@@ -97,7 +98,7 @@ class Player:
 
     def _play_pass(self) -> None:
         count = len(self._times)
-        first, frames = 0, list[bytes]()  # frames of one moment, made ready ahead of it
+        first, frames = 0, list[Any]()  # frames of one moment, made ready ahead of it
         while self.at < count and not self._stopped:
             now_ns = self._clock.now_ns()
             if self._look and now_ns >= self._next_look_ns + self._putting_off_ns():

@@ -63,7 +63,7 @@ def choose(log: Log, types: Sequence[str], systems: Sequence[str], start: str | 
     """What the options of a command say. Raises UsageError for what the log does not hold."""
     names = held_names(types, names_in(log), log.path)
     if systems and log.scan is None:
-        raise UsageError(f"--system: {log.path} is a log that an autopilot wrote of itself, it names no systems")
+        raise UsageError(f"--system: {log.path} is of the kind {log.kind}, which names no systems")
     first, last = log.span_us()
     between = None
     if start is not None or end is not None:

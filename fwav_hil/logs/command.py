@@ -28,7 +28,8 @@ def log_group() -> None:
     """Read telemetry logs.
 
     LOG is MAVLink telemetry (.tlog of this project, QGroundControl, MAVProxy, mavlink-router, Mission Planner; or a raw
-    stream), ArduPilot's .BIN or PX4's .ulg; its first bytes tell which. Damage is counted and passed over.
+    stream), ArduPilot's .BIN or .log, PX4's .ulg, or of a CAN bus (candump's .log, .asc, .blf, .trc); its first bytes
+    tell which. Damage is counted and passed over.
     """
 
 

@@ -30,7 +30,9 @@ def replay_command(
     log: Annotated[Path, Argument(type=EXISTING)],
     *,
     targets: Annotated[tuple[str, ...], Option(
-        "--to", "A link (it holds '://'): send the frames there. A time: where to end, as --from.", "URI|TIME"
+        "--to",
+        "A link (it holds '://'), for a log of a CAN bus can:URI: send the frames there. A time: where to end, as --from.",
+        "URI|TIME",
     )] = (),
     into: Annotated[Literal["controller", "emulator"] | None, Option(
         "--into",
@@ -47,15 +49,15 @@ def replay_command(
     into_options: IntoOptions,
     json_path: JsonPath = None,
 ) -> int:  # fmt: skip
-    """Replay LOG (a telemetry log, or a run folder): to a link, or into a controller or an emulator.
+    """Replay LOG (a telemetry log, or a run folder): to a link, or into a controller or an emulator; a CAN log to a bus.
 
     To a link, on a terminal: space holds and goes on, n sends one frame, the arrow keys seek, q ends.
 
     \b
     Exit codes with --into: 0 no difference, 1 a difference; others as ever.
     """
-    uris = [target for target in targets if "://" in target]
-    ends = [target for target in targets if "://" not in target]
+    uris = [target for target in targets if "://" in target or target.startswith("can:")]
+    ends = [target for target in targets if target not in uris]
     if len(uris) > 1 or len(ends) > 1 or (len(uris) == 1) == (into is not None):
         raise UsageError(
             "say where to replay once: --to URI (and --to TIME for the end), or --into controller|emulator"
@@ -68,6 +70,14 @@ def replay_command(
         )
     if into:
         return _replay_into(log, into, into_options, options.wait_s, json_path)
+    if uris[0].startswith("can:"):
+        of_messages = {
+            "--from": begin, "--to TIME": ends, "--types": types, "--system": systems, "--rewrite-time": options.rewrite_time,
+            "--signing-key": options.key, "--realtime": options.realtime,
+        }  # fmt: skip
+        if misplaced := [name for name, given in of_messages.items() if given]:
+            raise UsageError(f"{', '.join(misplaced)}: of no effect on a log of a CAN bus: leave it out")
+        return _replay_to_can(log, uris[0], options, json_path)
     from fwav_hil.logs.choice import choose, choose_frames, open_telemetry
     from fwav_hil.replay.to_link import replay_to
 
@@ -81,6 +91,22 @@ def replay_command(
         f"{result['frames']} frames, {result['log_s']:.1f} s of log in {result['wall_s']:.1f} s"
         + (f" ({result['speed_measured']:.4g} x)" if result["speed_measured"] else "")
         + (f", late by {shown}" if shown else ""),
+        err=is_stdout(json_path),
+    )
+    show_json(json_path, result)
+    if result["interrupted"]:
+        raise Interrupted(f"interrupted after {result['frames']} frames")
+    return 0
+
+
+def _replay_to_can(log: Path, uri: str, options: ReplayOptions, json_path: Path | None) -> int:
+    from fwav_hil.replay.to_can import replay_to_can
+
+    _, stop = begin_process()
+    result = replay_to_can(log, uri, options, stop)
+    left_out = f"; left out: {result['left_out']} that no classical bus carries" if result["left_out"] else ""
+    click.echo(
+        f"{result['frames']} frames, {result['log_s']:.1f} s of log in {result['wall_s']:.1f} s{left_out}",
         err=is_stdout(json_path),
     )
     show_json(json_path, result)

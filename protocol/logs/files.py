@@ -1,4 +1,7 @@
-"""A log of any kind that is read: MAVLink telemetry, ArduPilot's .BIN and .log, PX4's .ulg; told apart by their first bytes."""
+"""A log of any kind that is read, told apart by its first bytes.
+
+MAVLink telemetry, ArduPilot's .BIN and .log, PX4's .ulg, logs of a CAN bus.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +22,7 @@ from protocol.logs.tables import HEAD, Tables, row_counts, tables
 
 TELEMETRY, RAW = "MAVLink telemetry log", "raw MAVLink stream (no time stamps)"
 ARDUPILOT, ARDUPILOT_TEXT, PX4 = "ArduPilot dataflash log", "ArduPilot dataflash log as text", "PX4 log"
+CAN = "CAN log"
 _CHUNK = 1 << 15
 _FIRST_BYTES = 8192
 
@@ -154,7 +158,7 @@ def open_log(path: Path, *, progress: Progress | None = None) -> Log:
             first = file.read(_FIRST_BYTES)
     except OSError as error:
         raise LogError(f"cannot read the log {path}: {error.strerror}") from None
-    from protocol.logs import ardupilot, ardupilot_text, px4  # they load what only such logs need
+    from protocol.logs import ardupilot, ardupilot_text, can_log, px4  # they load what only such logs need
 
     try:
         if first.startswith(px4.MAGIC) or first.startswith(px4.ENCRYPTED):
@@ -166,6 +170,9 @@ def open_log(path: Path, *, progress: Progress | None = None) -> Log:
         if ardupilot_text.is_ardupilot_text(first):
             made, counters = ardupilot_text.read_ardupilot_text(path, progress)
             return _not_empty(Log(path, ARDUPILOT_TEXT, None, counters, made))
+        if suffix := can_log.format_of(first):
+            read_can = can_log.read_can_log(path, suffix)
+            return _not_empty(Log(path, CAN, None, read_can.counters, can_log.can_tables(read_can)))
     except OSError as error:
         raise LogError(f"cannot read the log {path}: {error.strerror}") from None
     scan = scan_tlog(path, progress=progress)
@@ -176,7 +183,7 @@ def _not_empty(log: Log) -> Log:
     if (len(log.scan) if log.scan is not None else sum(map(len, log.records.values()))) == 0:
         raise LogError(
             f"{log.path} holds no message: it is neither MAVLink telemetry (.tlog, raw) nor a log of ArduPilot (.BIN, "
-            ".log) or PX4 (.ulg)"
+            ".log) or PX4 (.ulg), nor of a CAN bus (.log, .asc, .blf, .trc)"
         )
     return log
 
