@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from protocol.compiled import compiled
-from protocol.logs.records import checksum_verdict, near, stamp_at
+from protocol.logs.records import checksum_verdict, near, stamp_at, untrimmed_length
 from protocol.wire.framing import Bytes, Table, frame_end, message_of, signature_size
+
+_LOOK_AHEAD = 64
 
 
 @compiled
@@ -42,6 +44,32 @@ def unknown_fits(data: Bytes, at: int, table: Table, last: int, stamp_size: int)
         if (data[inside] == 0xFD or data[inside] == 0xFE) and checksum_verdict(data, inside, table) == 1:
             return False
     return True
+
+
+@compiled
+def untrimmed_fits(data: Bytes, at: int, table: Table, last: int, stamp_size: int) -> bool:
+    """Whether a frame with a wrong checksum is one whose zeros were cut off behind it: it has a stamp, or a frame follows."""
+    end = frame_end(data, at)
+    if end < 0 or data[at] != 0xFD:
+        return False
+    if stamp_size:
+        framed = near(stamp_at(data, at - stamp_size), last)
+    else:
+        framed = record_follows(data, end + 2 + signature_size(data, at), -1, 0)
+    return framed and untrimmed_length(data, at, table) > 0
+
+
+@compiled
+def agreeing_ahead(data: Bytes, at: int, seed: int, table: Table, last: int, stamp_size: int) -> int:
+    """How many frames of the message at `at` follow soon, record upon record, whose checksums the same seed explains."""
+    message, agreeing = message_of(data, at), 0
+    for _ in range(_LOOK_AHEAD):
+        at = frame_end(data, at) + 2 + signature_size(data, at) + stamp_size
+        verdict = checksum_verdict(data, at, table) if at < len(data) else 0
+        if verdict in (0, -257) or (stamp_size and not near(stamp_at(data, at - stamp_size), last)):
+            break
+        agreeing += message_of(data, at) == message and verdict == -1 - seed
+    return agreeing
 
 
 @compiled

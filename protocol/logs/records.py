@@ -9,6 +9,7 @@ from protocol.compiled import compiled
 from protocol.wire.framing import (
     KNOWN,
     MAGIC_V1,
+    MAGIC_V2,
     SIZE_SHIFT,
     Bytes,
     Table,
@@ -17,6 +18,7 @@ from protocol.wire.framing import (
     frame_end,
     message_of,
     seed_that_explains,
+    seeded,
     signature_size,
     uint16_at,
 )
@@ -37,6 +39,7 @@ FRAME = np.dtype(
         ("flags", "u1"),
         ("known", "u1"),
         ("stamp_ok", "u1"),
+        ("stale_checksum", "u1"),
     ]
 )
 """One row a frame; `protocol.logs.scan` says what each column means."""
@@ -62,16 +65,43 @@ def checksum_verdict(data: Bytes, at: int, table: Table) -> int:
     if end < 0 or end + 2 + signature_size(data, at) > len(data):
         return 0
     entry = int(table[message_of(data, at)])
-    if data[at] == MAGIC_V1 and entry & KNOWN and byte(data, at + 1) > (entry >> SIZE_SHIFT & 0xFF):
-        return 0
     seed = seed_that_explains(crc_of(data, at + 1, end), uint16_at(data, end))
     if seed < 0:
         return -257
-    if entry & KNOWN and seed == (entry & 0xFF):
+    too_long = data[at] == MAGIC_V1 and byte(data, at + 1) > (entry >> SIZE_SHIFT & 0xFF)  # then of another dialect
+    if entry & KNOWN and seed == (entry & 0xFF) and not too_long:
         return 1
     if entry & LEARNED and seed == (entry >> LEARNED_SHIFT & 0xFF):
         return 2
     return -1 - seed
+
+
+@compiled
+def untrimmed_length(data: Bytes, at: int, table: Table) -> int:
+    """The length of payload with which the checksum of the frame at `at` holds, once zeros are put back; 0: none, or several.
+
+    QGroundControl's library cuts trailing zeros off frames of MAVLink 2 and leaves checksum and all as they were with them.
+    Any length up to the message's own is tried, so a damaged frame is taken for such a one by chance with a probability of
+    (lengths tried) / 65 536: 17 / 65 536 for a DISTANCE_SENSOR cut to 22 of its 39 bytes.
+    """
+    end = frame_end(data, at)
+    if end < 0 or data[at] != MAGIC_V2 or end + 2 + signature_size(data, at) > len(data):
+        return 0
+    entry, length = int(table[message_of(data, at)]), byte(data, at + 1)
+    if not entry & KNOWN or (length > 1 and data[end - 1] == 0):
+        return 0
+    found, wanted = 0, uint16_at(data, end)
+    for whole in range(length + 1, (entry >> SIZE_SHIFT & 0xFF) + 1):
+        crc = seeded(0xFFFF, whole)
+        for i in range(at + 2, end):
+            crc = seeded(crc, byte(data, i))
+        for _ in range(whole - length):
+            crc = seeded(crc, 0)
+        if seeded(crc, entry & 0xFF) == wanted:
+            if found:
+                return 0
+            found = whole
+    return found
 
 
 @compiled

@@ -16,6 +16,7 @@ Columns of `Scan.frames` (dtype `log_log_frames.FRAME`):
     signed      1 where a signature is behind the frame (whether it is a good one, only the key's owner can tell)
     flags       incompatibility flags (MAVLink 2)
     known       1: the dialect has the message and the checksum holds; 0: the dialect lacks it, so there is no definition
+    stale_checksum  1 where trailing zeros were cut off behind the checksum (`records.untrimmed_length`); payloads are right
     stamp_ok    0 where the frame has no stamp of its own, or a damaged one
 
 What is damaged is counted, never an error: bytes inserted, removed or changed cost the frames that they hit, no other.
@@ -52,6 +53,7 @@ COUNTERS = (
     "truncated_tail",
     "unknown_frames",
     "unknown_flags",
+    "stale_checksums",
 )
 
 STAMP_SIZE = 8
@@ -74,6 +76,7 @@ class Scan:
                 damaged_stamps      frames whose stamp was lost or absurd
                 truncated_tail      bytes of a record that the end of the file cuts short
                 unknown_frames      frames of messages the dialect lacks (kept)
+                stale_checksums     frames whose trailing zeros were cut off and whose checksum is the one before that (kept)
                 unknown_flags       frames with incompatibility flags of unknown meaning (kept here, left out of tables)
     """
 
@@ -190,5 +193,6 @@ def _count(
     else:
         frames["stamp_us"] = 0
     counters["unknown_frames"] = int(np.count_nonzero(frames["known"] == 0))
+    counters["stale_checksums"] = int(np.count_nonzero(frames["stale_checksum"]))
     counters["unknown_flags"] = int(np.count_nonzero(frames["flags"] & ~np.uint8(_SIGNED)))
     return counters

@@ -14,7 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from protocol.compiled import compiled, inlined
-from protocol.logs.candidates import best_of_overlapping, may_begin, unknown_fits
+from protocol.logs.candidates import (
+    agreeing_ahead,
+    best_of_overlapping,
+    may_begin,
+    unknown_fits,
+    untrimmed_fits,
+)
 from protocol.logs.records import LEARNED, LEARNED_SHIFT, OWN, State, checksum_verdict, near, stamp_at
 from protocol.wire.framing import (
     KNOWN,
@@ -45,6 +51,9 @@ from protocol.wire.framing import (
     LEARNT,
 ) = range(12)
 STATE_SIZE = 12
+
+UNTRIMMED = 3
+"""A verdict beside those of `checksum_verdict`: the checksum is that of the frame before its trailing zeros were cut off."""
 
 _AGREEING = 2  # frames beyond the first that must agree on a seed
 
@@ -81,6 +90,7 @@ def write_row(
     row["signed"] = signature_size(data, at) > 0
     row["known"] = known
     row["stamp_ok"] = stamp >= 0
+    row["stale_checksum"] = 0
 
 
 @compiled
@@ -148,7 +158,15 @@ def scan_slice(
                 fits = verdict > -257 and unknown_fits(data, at, table, state[LAST_STAMP], stamp_size)
                 if fits:
                     learn(table, votes, message, -1 - verdict, state)
-                if not fits or table[message] & KNOWN:
+                    if table[message] & KNOWN and not table[message] & LEARNED:
+                        # Another dialect's message of that number, where as many as it takes agree on the seed.
+                        ahead = agreeing_ahead(data, at, -1 - verdict, table, state[LAST_STAMP], stamp_size)
+                        for _ in range(min(ahead, _AGREEING)):
+                            learn(table, votes, message, -1 - verdict, state)
+                    verdict = checksum_verdict(data, at, table)
+                if verdict < 0 and untrimmed_fits(data, at, table, state[LAST_STAMP], stamp_size):
+                    verdict = UNTRIMMED
+                elif verdict < 0 and (not fits or table[message] & KNOWN):
                     state[CRC_FAILURES] += table[message] & KNOWN != 0
                     verdict = 0
             if verdict == 0:
@@ -171,6 +189,13 @@ def scan_slice(
                         and unknown_fits(data, at, table, state[LAST_STAMP], stamp_size)
                     ):
                         learn(table, votes, message_of(data, at), -1 - verdict, state)
+                        break
+                    if (
+                        verdict < 0
+                        and at >= floor + stamp_size
+                        and untrimmed_fits(data, at, table, state[LAST_STAMP], stamp_size)
+                    ):
+                        verdict = UNTRIMMED
                         break
                     verdict = 0
                 at += 1
@@ -203,7 +228,8 @@ def accept_frame(
         state[DAMAGED] += at - stamp_size - floor
     end = frame_end(data, at) + 2
     signature = signature_size(data, at)
-    write_row(data, at, end + signature - at, stamp, verdict == 1, frames, state[COUNT])
+    write_row(data, at, end + signature - at, stamp, verdict in (1, UNTRIMMED), frames, state[COUNT])
+    frames[state[COUNT]]["stale_checksum"] = verdict == UNTRIMMED
     if stamp_size and at == floor:
         state[UNSTAMPED] += 1
     else:
