@@ -12,6 +12,7 @@ from bridge.option_types import FILE
 from bridge.options import Argument, Option, command
 from bridge.shared_options import JsonPath
 from bridge.summary import is_stdout, show_json
+from fwav_hil.logs.dialect_option import Dialect
 from protocol.errors import UsageError
 
 LogPath = Annotated[Path, Argument()]
@@ -34,7 +35,7 @@ def log_group() -> None:
 
 
 @command("info", "fwav-hil log info flight.tlog --json -", group=log_group)
-def info_command(log: LogPath, json_path: JsonPath = None) -> None:
+def info_command(log: LogPath, dialect: Dialect = None, json_path: JsonPath = None) -> None:
     """Say what is in LOG: senders, messages, rates, gaps, losses, damage."""
     from fwav_hil.logs.choice import open_with_progress
     from fwav_hil.logs.info import log_info, print_info
@@ -51,6 +52,7 @@ def dump_command(
     systems: Systems = (),
     start: Start = None,
     end: End = None,
+    dialect: Dialect = None,
     as_json: Annotated[bool, Option("--json", "One JSON object a line instead of text.")] = False,
 ) -> None:
     """Print the messages of LOG, one a line, in their order."""
@@ -76,6 +78,7 @@ def plot_command(
     systems: Systems = (),
     start: Start = None,
     end: End = None,
+    dialect: Dialect = None,
 ) -> None:  # fmt: skip
     """Draw fields of LOG over time: MSG.field, or MSG.field[i] for one element of an array."""
     from fwav_hil.logs.choice import choose, open_with_progress
@@ -101,6 +104,7 @@ def export_command(
     out: Annotated[
         Path | None, Option("--out", "File (mcap) or folder; by default named after the log, in this folder.", "PATH")
     ] = None,
+    dialect: Dialect = None,
     json_path: JsonPath = None,
 ) -> None:  # fmt: skip
     """Write LOG in a format of other programs. What is there already is never overwritten."""

@@ -13,6 +13,7 @@ from bridge.option_types import EXISTING
 from bridge.options import Argument, Option, command
 from bridge.shared_options import JsonPath
 from bridge.summary import is_stdout, show_json, write_json
+from fwav_hil.logs.dialect_option import Dialect
 from fwav_hil.replay.options import TO, IntoOptions, ReplayOptions
 from protocol.errors import Interrupted, RunFolderError, UsageError
 
@@ -45,6 +46,7 @@ def replay_command(
     systems: Annotated[
         tuple[str, ...], Option("--system", "Only what these sent.", "ID[/COMPONENT]", only_with=TO)
     ] = (),
+    dialect: Dialect = None,
     options: ReplayOptions,
     into_options: IntoOptions,
     json_path: JsonPath = None,

@@ -10,6 +10,7 @@ from bridge.option_types import EXISTING
 from bridge.options import Argument, Option, command
 from bridge.shared_options import JsonPath
 from bridge.summary import is_stdout, show_json
+from fwav_hil.logs.dialect_option import Dialect
 
 if TYPE_CHECKING:
     from fwav_hil.replay.log_comparison import LogDifference
@@ -31,6 +32,7 @@ def diff_command(
         "[FIELD=]VALUE"
     )] = (),
     types: Annotated[tuple[str, ...], Option("--types", "Compare only these messages.", "NAME,...")] = (),
+    dialect: Dialect = None,
     json_path: JsonPath = None,
 ) -> int:  # fmt: skip
     """Compare two logs (or run folders): rows are paired by the sample time that their messages carry.

@@ -25,7 +25,6 @@ Read logs of QGroundControl, MAVProxy, mavlink-router, pymavlink and this projec
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +35,7 @@ import numpy.typing as npt
 
 from protocol.errors import LogError
 from protocol.logs import records, scan_kernels
-from protocol.logs.dialect import layouts
+from protocol.logs.dialect import layouts, of_dialect
 from protocol.logs.rows import mend_stamps
 from protocol.wire.framing import KNOWN, SIZE_SHIFT, Table
 
@@ -111,7 +110,7 @@ class Scan:
         return ends
 
 
-@functools.cache
+@of_dialect
 def _known_messages() -> npt.NDArray[np.int32]:
     """The ids that the dialect has, and the entry of each in the kernel's table: shape (2, messages)."""
     entries = [(number, KNOWN | message.size << SIZE_SHIFT | message.crc_seed) for number, message in layouts().items()]

@@ -9,13 +9,14 @@ follow in wire order, with pymavlink's types. A payload whose trailing zeros wer
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Collection
 
 import numpy as np
 import numpy.typing as npt
 
-from protocol.logs.dialect import BINARY, layouts, layouts_by_name
+from protocol.logs.dialect import BINARY, layouts, layouts_by_name, of_dialect
+from protocol.logs.names import distinct
+from protocol.logs.record_table import RESERVED
 from protocol.logs.records import IDS, State
 from protocol.logs.rows import count_rows, fill_rows
 from protocol.logs.scan import Scan
@@ -28,13 +29,15 @@ HEAD = (("t_us", "<i8"), ("system", "u1"), ("component", "u1"), ("frame_sequence
 Tables = dict[str, npt.NDArray[np.void]]
 
 
-@functools.cache
+@of_dialect
 def table_dtype(name: str) -> np.dtype[np.void]:
     """Row of the table of a message. Raises KeyError where the dialect has none of that name."""
     fields = layouts_by_name()[name].dtype
+    own = fields.names or ()
+    columns = distinct(own, [*(head for head, _ in HEAD), *RESERVED])
     kinds = (
-        (field, f"V{fields[field].itemsize}" if (name, field) in BINARY else fields[field])
-        for field in fields.names or ()
+        (column, f"V{fields[field].itemsize}" if (name, field) in BINARY else fields[field])
+        for column, field in zip(columns, own, strict=True)
     )
     return np.dtype([*HEAD, *kinds])
 
