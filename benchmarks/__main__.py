@@ -22,6 +22,7 @@ from benchmarks.codec import codec
 from benchmarks.loop import lockstep_tick, simulated_steps
 from benchmarks.processor import processor_time
 from benchmarks.read_log import read_log
+from benchmarks.read_own_log import read_own_log
 from benchmarks.replay_timing import replay_timing
 from benchmarks.row import ALTERNATIONS
 from benchmarks.start import start
@@ -39,6 +40,7 @@ BENCHMARKS: dict[str, Callable[[argparse.Namespace], dict[str, dict[str, Any]]]]
     "processor": lambda _given: processor_time(),
     "start": lambda _given: start(),
     "read_log": lambda _given: read_log(),
+    "read_own_log": lambda _given: read_own_log(),
     "replay_timing": lambda _given: replay_timing(),
     "can": lambda _given: can_protocols(),
 }

@@ -6,6 +6,7 @@ no infinity: NaN is null, infinity the text "Infinity" or "-Infinity".
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,7 @@ def write_mcap(log: Log, path: Path, choice: Choice, working: Working) -> dict[s
     """Write the chosen messages; returns how many of each. Unknown ones are left out: nothing says what is in them."""
     counts = log.counts(choice.names, between_us=choice.between_us, senders=choice.senders)
     total, done = sum(counts.values()), 0
-    with path.open("wb") as file:
-        writer = McapWriter(file, "fwav-hil")
+    with path.open("wb") as file, McapWriter(file, "fwav-hil") as writer:
         topics = _Topics(log, writer)
         for part in parts(log, choice.names, between_us=choice.between_us, senders=choice.senders, unknown=False):
             topics.write(part)
@@ -49,7 +49,7 @@ class _Topics:
         """Write the messages of a part of the log, in its order."""
         count = len(part.order)
         channels, times, sequences = (np.zeros(count, dtype=np.int64) for _ in range(3))
-        bodies: list[bytes] = [b""] * count
+        bodies = np.empty(count, dtype=object)
         for at, (name, table) in enumerate(part.tables.items()):
             rows = np.flatnonzero(part.order == at)
             if not len(rows):
@@ -58,28 +58,21 @@ class _Topics:
             times[rows] = table["t_us"]
             if "frame_sequence" in (table.dtype.names or ()):
                 sequences[rows] = table["frame_sequence"]
-            for row, body in zip(rows.tolist(), self._bodies(table), strict=True):
-                bodies[row] = body
+            bodies[rows] = self._bodies(table)
         if count:
-            self._writer.add_messages(channels, 1000 * times, sequences, bodies)
+            self._writer.add_messages(channels, 1000 * times, sequences, bodies.tolist())
 
     def _bodies(self, table: npt.NDArray[np.void]) -> list[bytes]:
-        """Each row as a JSON object: columns are written at once and taken apart again, which is far sooner than rows."""
+        """Each row as a JSON object."""
         fields = fields_of(table)
-        if not fields:
+        columns = [plain(table[field], for_json=True) for field in fields]
+        if not columns:
             return [b"{}"] * len(table)
-        names = [self._encode(field).replace(b"%", b"%%") for field in fields]
-        template = b"{" + b",".join(name + b":%b" for name in names) + b"}"
-        return list(map(template.__mod__, zip(*(self._values(table[field]) for field in fields), strict=True)))
-
-    def _values(self, column: npt.NDArray[Any]) -> list[bytes]:
-        values = plain(column, for_json=True)
-        if column.dtype.kind in "SOV":
-            return list(map(self._encode, values))
-        text = self._encode(values)
-        if column.ndim > 1:
-            return [b"[" + one + b"]" for one in text[2:-2].split(b"],[")]
-        return text[1:-1].split(b",")
+        names = {
+            f"field_{at}": field for at, field in enumerate(fields)
+        }  # a structure is written far sooner than a dict
+        row = msgspec.defstruct("Row", list(names), rename=names, gc=False)
+        return list(map(self._encode, itertools.starmap(row, zip(*columns, strict=True))))
 
     def _channels_of(self, name: str, table: npt.NDArray[np.void]) -> npt.NDArray[np.int64]:
         """The channel of each row, registered where it is met for the first time."""

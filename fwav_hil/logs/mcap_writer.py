@@ -6,9 +6,11 @@ a chunk, and the index of a chunk, are put together as arrays; every other recor
 
 from __future__ import annotations
 
+import itertools
 import zlib
 from collections.abc import Sequence
-from typing import BinaryIO
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import BinaryIO, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -34,14 +36,30 @@ _MESSAGE = np.dtype(
 )
 _BEHIND_LENGTH = _MESSAGE.itemsize - 9
 _CHUNK_BYTES = 1 << 20
+_LEVEL = 1
+
+
+class _Pending(NamedTuple):
+    """A chunk on its way: its records, what is made of them, and of each message channel, time and place in the chunk."""
+
+    records: bytes
+    compressed: Future[bytes]
+    channels: npt.NDArray[np.int64]
+    times_ns: npt.NDArray[np.int64]
+    offsets: npt.NDArray[np.int64]
 
 
 class McapWriter:
-    """Writes schemas, channels and messages to a stream. `finish` ends the file."""
+    """Writes schemas, channels and messages to a stream. `finish` ends the file; leaving the block lets go of the thread.
+
+    A chunk is compressed by that thread while the next one is made.
+    """
 
     def __init__(self, stream: BinaryIO, library: str) -> None:
         self._stream = stream
-        self._compressor = zstandard.ZstdCompressor(level=1)
+        self._compress = zstandard.ZstdCompressor(level=_LEVEL).compress
+        self._thread = ThreadPoolExecutor(1)
+        self._pending: _Pending | None = None
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         self._chunks: list[ChunkIndex] = []
@@ -80,7 +98,7 @@ class McapWriter:
             stop = max(start + 1, int(np.searchsorted(ends, before + _CHUNK_BYTES)))
             part = slice(start, stop)
             self._write_chunk(
-                channels[part], times_ns[part], sequences[part], bodies[start:stop], ends[part] - sizes[part] - before
+                channels[part], times_ns[part], sequences[part], bodies[start:stop], sizes[part], ends[part] - before
             )
             start = stop
 
@@ -90,21 +108,25 @@ class McapWriter:
         times_ns: npt.NDArray[np.int64],
         sequences: npt.NDArray[np.int64],
         bodies: Sequence[bytes],
-        offsets: npt.NDArray[np.int64],
+        sizes: npt.NDArray[np.int64],
+        ends: npt.NDArray[np.int64],
     ) -> None:
         heads = np.zeros(len(bodies), dtype=_MESSAGE)
         heads["opcode"], heads["channel"], heads["sequence"] = Opcode.MESSAGE, channels, sequences
-        heads["length"] = [_BEHIND_LENGTH + len(body) for body in bodies]
+        heads["length"] = sizes - (_MESSAGE.itemsize - _BEHIND_LENGTH)
         heads["log"] = heads["publish"] = times_ns
-        head = heads.tobytes()
-        pieces = [
-            piece
-            for at, body in zip(range(0, len(head), _MESSAGE.itemsize), bodies, strict=True)
-            for piece in (head[at : at + _MESSAGE.itemsize], body)
-        ]
-        records = b"".join(pieces)
-        first, last = int(times_ns.min()), int(times_ns.max())
-        packed = self._compressor.compress(records)
+        each = heads.view(f"V{_MESSAGE.itemsize}").tolist()
+        records = b"".join(itertools.chain.from_iterable(zip(each, bodies, strict=True)))
+        pending = _Pending(records, self._thread.submit(self._compress, records), channels, times_ns, ends - sizes)
+        self._write_pending()
+        self._pending = pending
+
+    def _write_pending(self) -> None:
+        """Write the chunk that was given to the thread last."""
+        if self._pending is None:
+            return
+        (records, compressed, channels, times_ns, offsets), self._pending = self._pending, None
+        packed, first, last = compressed.result(), int(times_ns.min()), int(times_ns.max())
         chunk = Chunk(
             compression="zstd",
             data=packed,
@@ -152,6 +174,7 @@ class McapWriter:
 
     def finish(self) -> None:
         """Write the summary, behind which nothing follows."""
+        self._write_pending()
         self._write(DataEnd(data_section_crc=0))
         start = self._stream.tell()
         statistics = Statistics(
@@ -183,6 +206,12 @@ class McapWriter:
         whole = _encoded(Footer(summary_start=start, summary_offset_start=offsets_start, summary_crc=0))
         crc = zlib.crc32(whole[:-4], zlib.crc32(data))  # of the summary and of the footer up to the checksum itself
         self._stream.write(whole[:-4] + crc.to_bytes(4, "little") + MCAP0_MAGIC)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._thread.shutdown()
 
     def _write(self, record: McapRecord) -> None:
         self._stream.write(_encoded(record))

@@ -158,7 +158,9 @@ def _timed(data: npt.NDArray[np.uint8], kind: Found) -> Timed:
     def field(name: str) -> npt.NDArray[Any] | None:
         if name not in columns:
             return None
-        table = of_records(data, kind.places, kind.numbers, [columns[name]], kind.layout.size)
+        column = columns[name]
+        at, size = kind.places + column.offset, np.dtype(column.kind).itemsize
+        table = of_records(data, at, kind.numbers, [column._replace(offset=0)], size)
         values: npt.NDArray[Any] = table.rows()["value"]
         return values
 

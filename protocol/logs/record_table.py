@@ -199,7 +199,6 @@ def copy_records(
 ) -> None:
     """Copy the `size` bytes at each place into `rows`, one behind the other."""
     for i in range(places.shape[0]):
-        at = places[i]
-        count = min(size, data.shape[0] - at)
-        for k in range(count):
-            rows[i * size + k] = data[at + k]
+        at, row = np.uint64(places[i]), np.uint64(i * size)  # unsigned: a signed index is first looked at for its sign
+        for k in range(np.uint64(min(size, data.shape[0] - places[i]))):
+            rows[row + k] = data[at + k]
