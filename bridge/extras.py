@@ -14,7 +14,7 @@ from protocol.errors import UsageError
 EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "can": ("can", "dronecan"),
-        "logs": ("mcap", "pyarrow", "pyulog"),
+        "logs": ("mcap", "pyarrow", "zstandard"),
         "plots": ("matplotlib",),
         "studies": ("hdrh", "scipy"),
     }

@@ -46,8 +46,12 @@ def replay_to_can(log: Path, uri: str, options: ReplayOptions, stop: StopFlag) -
 
     clock = PunctualClock(sleeps_half=False)
     player = Player(
-        log_times_ns(stamps_us, options.max_gap_s), lambda number, _: frames[number], bus.send, clock,
-        speed=options.speed, look=look
+        log_times_ns(stamps_us, options.max_gap_s),
+        lambda number, _: frames[number],
+        bus.send,
+        clock,
+        speed=options.speed,
+        look=look,
     )
     try:
         begun_ns = clock.now_ns()
