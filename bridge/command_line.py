@@ -1,4 +1,4 @@
-"""What all command lines of the project share: how errors end a command, how status reaches a user."""
+"""What all command lines of the project share: how errors end a command, and how status is shown to the user."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from protocol.errors import FwavHilError, Interrupted, RunFolderError, UsageErro
 
 
 def refuse_rate_that_cannot_fit(uri: str, rate_hz: float) -> None:
-    """Raise UsageError where a serial line cannot carry the contract at a rate; other links are not looked at."""
+    """Raise UsageError where a serial line is too slow for the messages at a rate; other links are not checked."""
     if scheme_of(uri).medium is Medium.SERIAL:
         from bridge.latency.budget import link_budget
 
@@ -27,7 +27,7 @@ def refuse_rate_that_cannot_fit(uri: str, rate_hz: float) -> None:
 
 
 def begin_process() -> tuple[Report, StopFlag]:
-    """Have signals stop this process where it may end; returns how it reports to a person, and its flag."""
+    """Install the signal handlers that stop this process cleanly; returns its report function and its stop flag."""
     stop = StopFlag()
     stop.install()
     return _report_text, stop
@@ -39,7 +39,7 @@ def _report_text(event: dict[str, Any]) -> None:
         click.echo(f"waiting on {event['link']}", err=True)
     elif kind == "realtime":
         for setting in event["settings"]:
-            remedy = f" (mend: {setting.remedy})" if setting.remedy else ""
+            remedy = f" (remedy: {setting.remedy})" if setting.remedy else ""
             what = "granted" if setting.granted else "refused"
             click.echo(f"real time: {setting.name} {what}: {setting.said}{remedy}", err=True)
     elif kind == "started":
@@ -73,7 +73,7 @@ def run_command(command: click.Command, name: str, arguments: Sequence[str] | No
     except (BrokenPipeError, SystemExit) as ended:
         if isinstance(ended, SystemExit) and ended.code != 1:
             raise  # a shell asked for completions
-        # Whoever read our output has left: click and rich then exit with 1. Hand the interpreter a place to flush to.
+        # The reader of our output has closed it: click and rich then exit with 1. Flushing at exit must not fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except ModuleNotFoundError as error:
@@ -82,7 +82,7 @@ def run_command(command: click.Command, name: str, arguments: Sequence[str] | No
         click.echo(f"{name}: {sentence}", err=True)
         return UsageError.exit_code
     except OSError as error:
-        # Files have named errors of their own; what is left is the output itself, on a full disk, say.
+        # Errors of files were converted before; this one is from standard output, for example on a full disk.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         click.echo(f"{name}: cannot write the output: {error.strerror or error}", err=True)
         return RunFolderError.exit_code

@@ -1,4 +1,4 @@
-"""One MAVLink component on a link: frames in, frames out, everything counted."""
+"""One MAVLink component on a link: sends and receives frames, with counters."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from protocol.wire.codec import Frame, FrameReader, FrameWriter, Layout
 
 
 class Endpoint:
-    """A link with a frame reader and a frame writer; what is sent together travels in one datagram.
+    """A link with a frame reader and a frame writer; frames sent together travel in one datagram.
 
-    Sequence numbers are followed once the run has begun, where both ends restart theirs: `reader.restart_sequences`.
+    Sequence numbers are checked once the run has begun, when both ends restart theirs: `reader.restart_sequences`.
     """
 
     def __init__(self, link: Link, system: int, component: int) -> None:
@@ -29,19 +29,19 @@ class Endpoint:
         self.link.send(b"".join(frames))
 
     def receive(self, timeout_s: float) -> list[Frame]:
-        """The frames of the next datagram or chunk; empty where none came within the timeout."""
+        """The frames of the next datagram or chunk; empty after the timeout."""
         data = self.link.recv(timeout_s)
         return self.reader.read(data) if data else []
 
     def counters(self) -> dict[str, int]:
-        """What the link and the reader have counted, by name."""
+        """Counters of the link and the reader, by name."""
         return {**self.link.counters(), **self.reader.counters}
 
 
 def refuse_other_scenario(peer: str, theirs: bytes, ours: bytes) -> None:
-    """Raise ScenarioMismatchError where the digest that a peer shows is not ours."""
+    """Raise ScenarioMismatchError where the peer's scenario digest is not ours."""
     if theirs != ours:
         raise ScenarioMismatchError(
-            f"the {peer} holds another scenario (digest {theirs.hex()}, here {ours.hex()}): "
+            f"the {peer} runs another scenario (digest {theirs.hex()}, here {ours.hex()}): "
             "start both ends with the same scenario file"
         )

@@ -1,4 +1,4 @@
-"""Libraries that a first run does not need, by the extra that installs them; and what is said where one is missing."""
+"""Optional libraries by the extra that installs them, and the error message where one is missing."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ EXTRAS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "studies": ("hdrh", "scipy"),
     }
 )
-"""Extra -> the modules that it brings, as they are imported; a test compares this with pyproject.toml."""
+"""Extra -> names of the modules that it installs; a test compares this with pyproject.toml."""
 
 
 def remedy(error: ModuleNotFoundError) -> str | None:
-    """What is missing and how to install it; None where no extra has it."""
+    """Message that names the missing library and how to install it; None where no extra has it."""
     module = (error.name or "").partition(".")[0]
     extra = next((extra for extra, modules in EXTRAS.items() if module in modules), None)
     return extra and f"this needs the library {module}, which is not installed: `pip install 'fwav-hil[{extra}]'`"
 
 
 def require(*extras: str) -> None:
-    """Raise UsageError where a library of these extras is missing: before a long run that would need it at its end."""
+    """Raise UsageError where a library of these extras is missing; called before a long run that needs it at the end."""
     for module in (module for extra in extras for module in EXTRAS[extra]):
         if importlib.util.find_spec(module) is None:
             raise UsageError(str(remedy(ModuleNotFoundError(name=module))))
@@ -38,7 +38,7 @@ def require(*extras: str) -> None:
 
 @contextlib.contextmanager
 def left_out_if_missing(what: str) -> Iterator[None]:
-    """Leave the rest of the block out where a library of an extra is missing, and say so on standard error."""
+    """Skip the rest of the block where a library of an extra is missing, with a message on standard error."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""Options of commands, each declared once: beside the field of a structure, or the parameter of a command, that it fills.
+"""Command-line options, each declared once: at the structure field, or the command parameter, that it fills.
 
     class ControllerOptions(msgspec.Struct, frozen=True, kw_only=True):
         wait_s: Annotated[float, Option("--wait", "How long to wait for the other end to appear.", "S", min=0.1)] = 30.0
@@ -6,9 +6,8 @@
     @command("controller", "fwav-hil controller flapper --wait 5")
     def controller(options: ControllerOptions, json_path: JsonPath = None) -> None: ...
 
-`command` makes the click command. A parameter whose type is a structure stands for the options of all its fields, those of
-nested structures included, and the function gets the structure filled in. A field without an `Option` has no option; it keeps
-its default.
+`command` makes the click command. A parameter whose type is a structure stands for the options of all its fields, nested
+structures included, and the function receives the filled structure. A field without an `Option` keeps its default.
 """
 
 from __future__ import annotations
@@ -28,18 +27,18 @@ from protocol.errors import UsageError
 
 _REQUIRED = msgspec.NODEFAULT
 _Given = Mapping[str, Any]
-"""What click read, by the name of the click parameter."""
+"""Values that click read, by the name of the click parameter."""
 
 
 @dataclass(frozen=True)
 class Option:
-    """How a value is given on a command line. Its type says the rest: a `Literal` its choices, a tuple that it may be repeated.
+    """How a value is given on a command line. The value's type sets the rest: a `Literal` gives choices, a tuple may repeat.
 
     flag       "--wait", or "--plots/--no-plots" for a bool that is true by default
-    metavar    stands for the value in the help
-    min, max   bounds of a number; min_open: without `min` itself
-    type       for a value that is written otherwise than its Python type
-    only_with  an option that must have been given for this one to do anything: "--into", or with its value: "--motor can"
+    metavar    placeholder of the value in the help
+    min, max   bounds of a number; min_open: `min` itself is excluded
+    type       click type, where the text of a value differs from its Python type
+    only_with  another option that this one requires: "--into", or with its value: "--motor can"
     """
 
     flag: str
@@ -55,7 +54,7 @@ class Option:
 
 @dataclass(frozen=True)
 class Argument:
-    """A value that is given by its place on the command line; a tuple takes all that are left."""
+    """A positional value on the command line; a tuple takes all remaining ones."""
 
     metavar: str | None = None
     _: KW_ONLY
@@ -63,7 +62,7 @@ class Argument:
 
 
 class Except:
-    """Fields of a structure that a command does not offer, or offers by another option."""
+    """Fields of a structure that a command does not offer, or offers with another option."""
 
     def __init__(self, *left_out: str, **changed: Option) -> None:
         self.marks: dict[str, Option | None] = {**dict.fromkeys(left_out), **changed}
@@ -72,9 +71,9 @@ class Except:
 def command(
     name: str, *examples: str, group: click.Group | None = None
 ) -> Callable[[Callable[..., Any]], click.Command]:
-    """Make a function a command whose help is its docstring and the examples; into `group`, where one is given.
+    """Make a command from a function; its help is the docstring and the examples. It is added to `group`, if given.
 
-    Raises TypeError where two options of one flag are not the same, or `Except` names no field.
+    Raises TypeError where one flag is declared in two different ways, or `Except` names an unknown field.
     """
 
     def make(function: Callable[..., Any]) -> click.Command:
@@ -104,7 +103,7 @@ def command(
 
 
 class _Options:
-    """The click parameters of one command, by flag or by name of the argument, and how to read them."""
+    """The click parameters of one command, by flag or argument name, and how to read their values."""
 
     def __init__(self) -> None:
         self.parameters: dict[str, click.Parameter] = {}
@@ -113,7 +112,7 @@ class _Options:
     def reader(
         self, name: str, kind: Any, default: Any, changed: Option | None = None
     ) -> Callable[[_Given], Any] | None:
-        """What takes the value of a parameter or field out of what was given; None where no option fills it."""
+        """A function that reads the value of a parameter or field from click's values; None where no option fills it."""
         marks = getattr(kind, "__metadata__", ())
         kind = get_args(kind)[0] if marks else kind
         if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
@@ -145,7 +144,7 @@ class _Options:
     def _option(self, mark: Option, kind: Any, default: Any) -> click.Parameter:
         flag = mark.flag.partition("/")[0]
         if self._declared.setdefault(flag, (mark, default)) != (mark, default):
-            raise TypeError(f"{flag} is declared twice, and not alike")
+            raise TypeError(f"{flag} is declared twice, in different ways")
         if flag not in self.parameters:
             kind, several = _element(kind)
             attributes: dict[str, Any] = {"required": True} if default is _REQUIRED else {"default": default}
@@ -160,18 +159,18 @@ class _Options:
         return self.parameters[flag]
 
     def check(self, given: _Given) -> None:
-        """Raise UsageError where an option was given that does nothing, since another one was not."""
+        """Raise UsageError where an option was given without the other option that it requires."""
         for flag in given_options():
             needed = self._declared[flag][0].only_with if flag in self._declared else ""
             other, _, value = needed.partition(" ")
             if other in self.parameters:
                 there = given[self.parameters[other].name or ""]
                 if there != value if value else not there:
-                    raise UsageError(f"{flag} does nothing without {needed}: add that, or leave {flag} out")
+                    raise UsageError(f"{flag} has no effect without {needed}: add it, or leave {flag} out")
 
 
 def given_options() -> list[str]:
-    """What was given to the running command: options by their flag (the first of two), arguments by their name in capitals."""
+    """What was given to the running command: options by their (first) flag, arguments by their name in capitals."""
     context = click.get_current_context()
     return [
         parameter.opts[0] if parameter.param_type_name == "option" else parameter.human_readable_name
@@ -188,7 +187,7 @@ def _argument(mark: Argument, name: str, kind: Any, default: Any) -> click.Argum
 
 
 def _element(kind: Any) -> tuple[Any, bool]:
-    """The type of one value: without None, and of a tuple that of its elements; and whether it is of a tuple."""
+    """The type of one value, without None (of a tuple: that of its elements), and whether it was a tuple."""
     if get_origin(kind) in (Union, types.UnionType):
         (kind,) = (one for one in get_args(kind) if one is not types.NoneType)
     return (get_args(kind)[0], True) if get_origin(kind) is tuple else (kind, False)

@@ -1,4 +1,4 @@
-"""The parameter protocol towards one peer: list, read, set. Source: the MAVLink guide of it."""
+"""The MAVLink parameter protocol for one peer: list, read, set. Source: the MAVLink guide on it."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from protocol.wire.parameter_mapping import Refusal, Wanted
 from protocol.wire.schedule import Saying
 
 BURST = 16
-"""Values of a list that are said at one occasion."""
+"""Values of a list that are sent at once."""
 
 
 class ParameterTable(Protocol):
-    """The parameters of a component, in the order of their indices; `controller.parameters.Parameters` is one."""
+    """The parameters of a component by index; implemented by `controller.parameters.Parameters`."""
 
     @property
     def table(self) -> Sequence[Any]:
-        """As many items as there are parameters."""
+        """One item per parameter."""
 
     @property
     def counters(self) -> dict[str, int]:
-        """With parameters_set and parameters_refused."""
+        """Counters, with parameters_set and parameters_refused."""
 
     def index(self, name: str) -> int | None:
         """The index of a name, or None."""
 
     def saying(self, index: int) -> Saying:
-        """PARAM_VALUE of a parameter now."""
+        """PARAM_VALUE with a parameter's present value."""
 
     def set(self, index: int, kind: int, value: float, *, armed: bool) -> Refusal | None:
-        """Set a parameter; None where it now has the value, else why it has not."""
+        """Set a parameter; None where it now has the value, else the reason for the refusal."""
 
 
 class ParameterServer:
     """Answers a peer's PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET to `who`, our (system, component).
 
-    is_armed: whether sets must be refused. on_change: is told the index of what was set.
+    is_armed: whether sets must be refused. on_change: called with the index of a changed parameter.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class ParameterServer:
         }
 
     def handle(self, frame: Frame) -> bool:
-        """Take a frame of the protocol; whether it was one for this vehicle."""
+        """Handle a frame of the protocol; whether it was one for this vehicle."""
         if frame.message_id not in self._handlers:
             return False
         decode, handler = self._handlers[frame.message_id]
@@ -74,7 +74,7 @@ class ParameterServer:
         return True
 
     def due(self) -> list[Saying]:
-        """What is to be said now: answers, and the next values of a list."""
+        """Messages to send now: answers, and the next values of a list."""
         sayings, self._answers = self._answers, []
         for _ in range(min(BURST, len(self._listing))):
             sayings.append(self._parameters.saying(self._listing.popleft()))
@@ -100,7 +100,7 @@ class ParameterServer:
         if wanted.value is not None:
             refusal = self._parameters.set(index, wanted.kind, wanted.value, armed=self._is_armed())
         if refusal:
-            # First: a station that knows it need not take the old value for a miss.
+            # Sent before the value: a station that supports PARAM_ERROR then need not retry because of the old value.
             self._refuse(wanted, asker, refusal)
         self._answers.append(self._parameters.saying(index))
         if not refusal and self._parameters.counters["parameters_set"] > before:

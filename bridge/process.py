@@ -1,4 +1,4 @@
-"""What every process of the project does alike: stop when asked, end with its parent, tell its status, sit on a core."""
+"""What all processes of the project share: stop on request, end with the parent, take a folder, set core affinity."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _CONNECT_SLICE_S = 0.2
 
 
 class StopFlag:
-    """Set by SIGINT and SIGTERM; looked at where a loop may end with nothing half-written.
+    """Set by SIGINT and SIGTERM; checked where a loop can end without leaving files half-written.
 
-    peer_restarts   times SIGURG came: the parent has started a process again that this one may be waiting for. The system
-                    ignores that signal in a process that has not got so far yet.
+    peer_restarts   number of SIGURG received: the parent has restarted a process that this one may be waiting for. A
+                    process that has not installed its handler yet ignores that signal.
     """
 
     def __init__(self) -> None:
@@ -27,7 +27,7 @@ class StopFlag:
         self.peer_restarts = 0
 
     def install(self) -> None:
-        """Take over these signals in this process; a second one to stop acts as it would by default."""
+        """Install the signal handlers; a second stop signal has its default effect."""
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
         signal.signal(signal.SIGURG, self._on_restart)
@@ -46,7 +46,7 @@ class StopFlag:
 
 
 def open_patiently(uri: str, wait_s: float, stop: StopFlag) -> Link:
-    """`open_link`, waiting up to wait_s for a server to appear; a stop is heard while waiting.
+    """`open_link`, waiting up to wait_s for a server to appear; a stop request ends the wait.
 
     Raises what `open_link` raises, and Interrupted.
     """
@@ -62,29 +62,29 @@ def open_patiently(uri: str, wait_s: float, stop: StopFlag) -> Link:
 
 
 def take_folder(folder: Path, *names: str) -> None:
-    """Make the folder that a process writes files of these names to at its end, before it begins.
+    """Make the folder, before a process begins, to which it writes files of these names at its end.
 
-    Raises RunFolderError where it cannot be made, or holds one of them: what is there stays.
+    Raises RunFolderError where it cannot be made or holds one of the files: nothing is overwritten.
     """
-    from bridge.summary import make_folder  # here: who only wants signals need not wait for numpy
+    from bridge.summary import make_folder  # imported here: code that needs only signals need not load numpy
 
     for name in names:
         if (folder / name).exists():
             raise RunFolderError(
-                f"{folder / name} is there already, and stays: choose another folder with --out, or remove it"
+                f"{folder / name} exists already and is not overwritten: choose another folder with --out, or remove it"
             )
     make_folder(folder)
 
 
 def end_with_parent() -> None:
-    """Have the system send SIGTERM to this process when its parent ends, however that ends (Linux only)."""
+    """Have the system send SIGTERM to this process when its parent ends for any reason (Linux only)."""
     if sys.platform == "linux":
         set_parent_death_signal = 1
         ctypes.CDLL(None).prctl(set_parent_death_signal, signal.SIGTERM)
 
 
 def sit_on_core(core: int) -> None:
-    """Let this process run on one core only; left as it is where the system has no such call or refuses."""
+    """Set the core affinity of this process to one core; no effect where the system refuses or has no such call."""
     if hasattr(os, "sched_setaffinity"):
         try:
             os.sched_setaffinity(0, {core})

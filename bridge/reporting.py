@@ -1,4 +1,4 @@
-"""How a process tells what happens: one event at a time, to a person or to its parent."""
+"""Status reports of a process: one event at a time, to the user or to the parent process."""
 
 from __future__ import annotations
 

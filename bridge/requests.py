@@ -1,8 +1,8 @@
-"""The requests of a link's peer to one component: commands, and messages at a rate or once. Each is answered.
+"""Requests of a link's peer to one component: commands, and messages at a rate or once. Each is acknowledged.
 
-MAV_CMD_SET_MESSAGE_INTERVAL (511), parameters: message id, interval in us (-1: no longer, 0: as by default), and
-MAV_CMD_REQUEST_MESSAGE (512), parameter: message id, are obeyed for the messages that are offered; other commands by their
-own handlers. Times are those of whoever asks what is due: simulation time in both clock modes.
+MAV_CMD_SET_MESSAGE_INTERVAL (511), parameters: message id, interval in us (-1: stop, 0: default), and
+MAV_CMD_REQUEST_MESSAGE (512), parameter: message id, are accepted for the messages that are offered; other commands have
+their own handlers. Intervals count in simulation time in both clock modes.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from protocol.wire.requests import Request, Result
 from protocol.wire.schedule import Schedule
 
 Handler = Callable[[Request], Result]
-"""Obeys a request, or says why not."""
+"""Carries out a request, or refuses it with a reason."""
 
 
 class Requests:
-    """What one link has asked of the component `who`.
+    """The requests of one link to the component `who`.
 
-    schedule: what that component says on the link, which 511 and 512 change and which carries the answers. offered: names of
-    its messages that may be asked for. commands: command -> handler.
+    schedule: the messages of that component on the link, which 511 and 512 change and which sends the answers. offered:
+    names of its messages that may be requested. commands: command -> handler.
 
-    counters  requests          commands for this component         requests_refused  those that were not obeyed
+    counters  requests          commands for this component         requests_refused  those that were refused
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Requests:
         self.counters = {"requests": 0, "requests_refused": 0}
 
     def handle(self, frame: Frame) -> bool:
-        """Obey or refuse a COMMAND_LONG; whether it was one for this component."""
+        """Carry out or refuse a COMMAND_LONG; whether it was one for this component."""
         if frame.message_id != mapping.COMMAND_LONG.message_id:
             return False
         request = requests.decode_request(frame.payload)

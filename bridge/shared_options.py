@@ -1,4 +1,4 @@
-"""Options that several commands have: of a scenario, of both ends of a link, of results."""
+"""Options that several commands share: for a scenario, for both ends of a link, for results."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DEFAULT_EMULATOR_LINK = "udpin://127.0.0.1:14560"
 DEFAULT_CONTROLLER_LINK = "udpout://127.0.0.1:14560"
 
 DelayNs = Annotated[int, Option(
-    "--delay", "Real time: let every command arrive later by so much wall time, such as 5ms.", "TIME",
+    "--delay", "Real time: delay every command by this much wall time, such as 5ms.", "TIME",
     type=DurationNs()
 )]  # fmt: skip
 JsonPath = Annotated[Path | None, Option(
@@ -26,22 +26,22 @@ JsonPath = Annotated[Path | None, Option(
 )]  # fmt: skip
 LAW = Option(
     "--law",
-    "Law instead of the scenario's, such as ude, pd or dob; an unknown name is answered with the list of all.",
+    "Law instead of the scenario's, such as ude, pd or dob; an unknown name gives the list of all laws.",
     "LAW",
 )
 OnLogError = Annotated[Literal["stop", "continue"], Option(
     "--on-log-error",
-    "Where the disk is full or cannot be written: end with what was recorded, or go on without a complete log."
+    "What to do when the disk is full or cannot be written: stop, or continue with an incomplete log."
 )]  # fmt: skip
 Plots = Annotated[bool, Option("--plots/--no-plots", "Draw the plots (PNG).")]
 RealTime = Annotated[bool, Option(
     "--realtime",
-    "In real time: ask for SCHED_FIFO, locked memory, a core of its own, no deep idle states, timer slack 1 ns, no "
-    "garbage collection, and poll the end of each wait; what the system refuses is said."
+    "Real time: ask for SCHED_FIFO, locked memory, a core of its own, no deep idle states, timer slack 1 ns, no "
+    "garbage collection, and poll the end of each wait; settings that the system refuses are reported."
 )]  # fmt: skip
 Station = Annotated[str | None, Option(
     "--station",
-    "A ground station's link, besides the loop's: udpout://127.0.0.1:14550, udpin://, tcpin:// (docs/station.md).",
+    "Extra link for a ground station: udpout://127.0.0.1:14550, udpin://, tcpin:// (docs/station.md).",
     "URI"
 )]  # fmt: skip
 WaitS = Annotated[float, Option("--wait", "How long to wait for the other end to appear.", "S", min=0.1)]
@@ -53,9 +53,9 @@ def folder_option(help: str) -> Option:
 
 
 class ScenarioChoice(msgspec.Struct, frozen=True, kw_only=True):
-    """A scenario, a file or the name of one that comes with the project, and what a command line changes in it.
+    """A scenario (a file, or the name of one that comes with the project) and the keys that a command line changes in it.
 
-    None leaves a key as the file has it.
+    None keeps the value of the file.
     """
 
     scenario: Annotated[str, Argument()] = "flapper"
@@ -72,7 +72,7 @@ class ScenarioChoice(msgspec.Struct, frozen=True, kw_only=True):
         return find_scenario(self.scenario)
 
     def load(self) -> Scenario:
-        """The scenario with the changes. Raises ScenarioError."""
+        """The scenario with these changes applied. Raises ScenarioError."""
         return with_overrides(
             load_scenario(self.path),
             law=self.law,
@@ -83,32 +83,33 @@ class ScenarioChoice(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EndOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """What both ends of a link are told alike.
+    """Options that both ends of a link take.
 
     link     URI of this end
-    spin_s   in lockstep see `Link.spin_s` (None: 0); in real time how long to poll before what is due (None: as measured,
-             with `realtime`, else 0)
-    legs     note when each sample and command was where
-    key      of signatures on the link, 32 bytes
+    spin_s   in lockstep see `Link.spin_s` (None: 0); in real time how long to poll before each deadline (None: as
+             measured with `realtime`, else 0)
+    legs     record time stamps of each sample and command (latency segments)
+    key      signing key of the link, 32 bytes
     """
 
     link: Annotated[str, Option("--link", "This end of the link.", "URI")] = DEFAULT_EMULATOR_LINK
     clock: Annotated[ClockMode, Option(
         "--clock",
-        "lockstep: simulation time waits for every answer, so the result is the same everywhere. realtime: wall time."
+        "lockstep: simulation time waits for every answer, so results are reproducible. realtime: wall time."
     )] = "lockstep"  # fmt: skip
     realtime: RealTime = False
     spin_s: Annotated[float | None, Option(
         "--spin-us",
-        "Poll this long instead of what is measured at the start: in real time before each deadline, in lockstep for "
-        "each answer.", "US", type=MICROSECONDS
+        "Poll for this long, instead of the time measured at the start: in real time before each deadline, in lockstep "
+        "for each answer.", "US", type=MICROSECONDS
     )] = None  # fmt: skip
     legs: Annotated[bool, Option(
-        "--legs", "Real time: note when each sample and command was where, in the run folder; see `fwav-hil latency`."
+        "--legs", "Real time: record latency segments (time stamps of each sample and command) in the run folder; see "
+        "`fwav-hil latency`."
     )] = False  # fmt: skip
     wait_s: WaitS = 30.0
     key: Annotated[bytes | None, Option(
         "--signing-key",
-        "Sign all that is said on the loop's link and believe only what is signed with this key: 64 hex digits or 32 "
-        "bytes.", "FILE", type=KEY_FILE
+        "Sign all frames sent on the loop's link, and drop received frames not signed with this key: 64 hex digits or "
+        "32 bytes.", "FILE", type=KEY_FILE
     )] = None  # fmt: skip

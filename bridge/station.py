@@ -1,6 +1,6 @@
-"""A ground station's link: heard without waiting, told heartbeats by the wall clock, and recorded.
+"""A ground station's link: read without waiting, with heartbeats by wall time, and recorded.
 
-The station may come, go and come again: nothing it does ends a run. Frames carry numbers of this link's own.
+The station may connect and disconnect at any time: nothing it does ends a run. The link has its own sequence numbers.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from protocol.wire.codec import Frame, FrameReader, FrameWriter, Layout
 from protocol.wire.streams import stream
 
 POLL_HZ = 50.0
-"""How often an end of the loop looks at its station's link, in simulation time."""
+"""How often an end of the loop polls its station's link, in simulation time."""
 _MOST_AT_ONCE = 64
 
 
@@ -34,7 +34,7 @@ def open_station(
     wait_s: float,
     stop: StopFlag,
 ) -> Iterator[Station | None]:
-    """The station at a link, its words recorded in the file `record`; None where no link is named.
+    """The station on a link, its messages recorded in the file `record`; None where no link is given.
 
     Raises what `open_patiently` raises, and RunFolderError.
     """
@@ -54,7 +54,7 @@ def open_station(
 class Station:
     """One end of a station's link, as the component `who`.
 
-    heartbeat: the payload of this component's. log: where all that is said is kept, or None.
+    heartbeat: gives the payload of this component's HEARTBEAT. log: records all frames both ways, or None.
     """
 
     def __init__(
@@ -73,12 +73,12 @@ class Station:
         self._writer = FrameWriter(*who)
         self._log = log
         self.departures = 0
-        """How often a station has left, or had to make room."""
+        """How often a station has disconnected, or was released."""
         self.t_us = 0
-        """The time under which frames are logged."""
+        """The time with which frames are logged."""
 
     def poll(self) -> list[Frame]:
-        """The frames that came since the last poll; a heartbeat is sent if one is due."""
+        """The frames received since the last poll; a heartbeat is sent if one is due."""
         frames: list[Frame] = []
         try:
             if self._due.at(self._clock.now_ns()):
@@ -96,7 +96,7 @@ class Station:
         return frames
 
     def say(self, message: Layout, payload: bytes) -> None:
-        """Send a frame, which is lost where nobody is there."""
+        """Send a frame; it is lost where no station is connected."""
         frame = self._writer.seal(message, payload)
         try:
             self._link.send(frame)
@@ -106,11 +106,11 @@ class Station:
             self._log.write(self.t_us, frame)
 
     def release(self) -> None:
-        """Make room for another station."""
+        """Release the station, so that another one can connect."""
         self.departures += 1
         self._link.release_peer()
 
     def counters(self) -> dict[str, int]:
-        """What the link and its reader have counted, each name beginning with station_."""
+        """Counters of the link and its reader, each name beginning with station_."""
         counted = {**self._link.stats.as_dict(), **self._reader.counters}
         return {f"station_{name}": count for name, count in counted.items()}

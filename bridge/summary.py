@@ -1,4 +1,4 @@
-"""What a run leaves in words and numbers: folders, JSON files, percentiles."""
+"""Results of a run: folders, JSON files, percentiles."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def make_folder(path: Path) -> None:
 
 
 def refuse_existing_run(folder: Path) -> None:
-    """Raise RunFolderError where the folder holds a run already: nothing recorded is overwritten."""
+    """Raise RunFolderError where the folder holds a run already: recorded data is never overwritten."""
     if (folder / "run.tlog").exists() or (folder / "ground_truth.npy").exists():
         raise RunFolderError(
-            f"{folder} holds a run already, which stays: choose another folder with --out, or remove it"
+            f"{folder} holds a run already, which is not overwritten: choose another folder with --out, or remove it"
         )
 
 
@@ -38,7 +38,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write an indented JSON file in one piece: a reader sees the old file or the whole new one. Raises RunFolderError."""
+    """Write an indented JSON file atomically: a reader sees the old file or the complete new one. Raises RunFolderError."""
     data = msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n"
     partial = path.with_name(path.name + ".part")
     try:
@@ -51,23 +51,23 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def is_stdout(path: Path | None) -> bool:
-    """Whether a `--json` asks for standard output, which then must hold nothing else."""
+    """Whether `--json` selects standard output, which then must hold nothing else."""
     return str(path) == "-"
 
 
 def show_json(path: Path | None, content: dict[str, Any]) -> None:
-    """Write the result of a command where its `--json` says: a file, `-` for standard output, or nowhere (None)."""
+    """Write the result of a command to the destination of its `--json`: a file, `-` for standard output, or none (None)."""
     if path is None:
         return
     if is_stdout(path):
         sys.stdout.write(msgspec.json.format(msgspec.json.encode(content), indent=2).decode() + "\n")
-        sys.stdout.flush()  # here, where it is noticed that nobody reads
+        sys.stdout.flush()  # here, so that a closed pipe is noticed now
     else:
         write_json(path, content)
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file; empty where there is none. Raises RunFolderError where it is damaged."""
+    """Read a JSON file; empty where the file is missing. Raises RunFolderError where it is damaged."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
     except FileNotFoundError:
@@ -77,7 +77,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def percentiles_us(durations_ns: Sequence[int]) -> dict[str, float | None]:
-    """p50, p99, p999 and max in microseconds; None each where there is nothing to count."""
+    """p50, p99, p999 and max in microseconds; all None without durations."""
     if not durations_ns:
         return dict.fromkeys(("p50", "p99", "p999", "max"))
     import numpy as np  # here: see `protocol.messages`

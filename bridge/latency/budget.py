@@ -1,7 +1,7 @@
-"""Whether what the contract says fits a link at a rate, and what each hop of the loop delays it by.
+"""Whether the messages of the loop fit a link at a rate, and the delay that each hop adds.
 
-Sizes are those of real frames, trailing zeros cut off as on the wire. A serial line (8N1) carries baud / 10 bytes a second
-each way and is a hard bound. A network is counted with its headers against an assumed speed, which refuses nothing sane.
+Sizes are those of real frames, with trailing zeros cut off as on the wire. A serial line (8N1) carries baud / 10 bytes per
+second each way, a hard bound. A network is counted with its headers against an assumed speed that any usual rate fits.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from protocol.wire.streams import STREAMS, End, Stream
 
 USUAL_BAUDS = (57_600, 115_200, 230_400, 460_800, 921_600, 1_500_000, 2_000_000, 3_000_000, 4_000_000)
 ADAPTER_HOLD_S = 0.001
-"""What a USB adapter may hold bytes for with the low latency that the link asks for when it is opened."""
+"""Longest time that a USB adapter holds bytes back in the low-latency mode that the link requests when it is opened."""
 
 _FASTEST_HZ = 10_000_000
 _WAYS = (("emulator to controller", End.EMULATOR), ("controller to emulator", End.CONTROLLER))
 
 
 class Share(msgspec.Struct, frozen=True):
-    """One message in one direction: bytes of a frame, frames and bytes a second."""
+    """One message in one direction: bytes per frame, frames and bytes per second."""
 
     message: str
     frame_bytes: int
@@ -39,8 +39,8 @@ class Share(msgspec.Struct, frozen=True):
 
 
 class Way(msgspec.Struct, frozen=True):
-    """One direction. share: of its capacity; tick_bytes: what one period sends; highest_rate_hz: the highest whole
-    rate that fits, or less than 1 where none does.
+    """One direction. share: used fraction of its capacity; tick_bytes: bytes sent per period; highest_rate_hz: the highest
+    whole rate that fits, or less than 1 where none does.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Way(msgspec.Struct, frozen=True):
 
 
 class Hop(msgspec.Struct, frozen=True):
-    """What one hop adds between a sample and the command that answers it, with where the figure comes from."""
+    """Delay that one hop adds between a sample and the command that answers it, and where the figure comes from."""
 
     name: str
     delay_s: float
@@ -62,7 +62,7 @@ class Hop(msgspec.Struct, frozen=True):
 
 
 class Budget(msgspec.Struct, frozen=True):
-    """A link at a rate. fits: the verdict; sentence: it in words; delay_s: of all hops, in periods too."""
+    """A link at a rate. fits: the verdict; sentence: the verdict in words; delay_s, delay_periods: sum of all hops."""
 
     link: str
     rate_hz: float
@@ -77,7 +77,7 @@ class Budget(msgspec.Struct, frozen=True):
 
 @functools.cache
 def frame_bytes(message: str) -> int:
-    """Size of a frame of `message` as the contract sends it; of one it has no example of, the whole message's.
+    """Size of a frame of `message` as it is sent in the loop; without an example of it, the size with a full payload.
 
     Raises KeyError where the dialect has no such message.
     """
@@ -88,7 +88,7 @@ def frame_bytes(message: str) -> int:
 
 
 def _examples() -> dict[str, bytes]:
-    """Payloads with every number in use that the contract uses."""
+    """Example payloads in which every field used by the loop is non-zero."""
     t_ns, q, rates = 1_234_567_891_000, np.linspace(0.1, 0.6, 6), np.linspace(1.1, 1.6, 6)
     return {
         "HEARTBEAT": mapping.encode_controller_heartbeat(armed=True),
@@ -104,7 +104,7 @@ def _examples() -> dict[str, bytes]:
 
 
 def link_budget(uri: str, rate_hz: float) -> Budget:
-    """The budget of a link at a rate. Raises LinkUriError where the URI names no link."""
+    """The budget of a link at a rate. Raises LinkUriError where the URI is not valid."""
     link = parse_link_uri(uri)
     ways = tuple(_way(name, end, link, rate_hz) for name, end in _WAYS)
     hops = _hops(link, ways)
@@ -133,7 +133,7 @@ def _way(name: str, end: End, link: LinkUri, rate_hz: float) -> Way:
         return tuple(_share(row, hz) for row in sent)
 
     def total_at(hz: float) -> float:
-        # What is not of the tick travels in a tick's datagram.
+        # Messages that are not sent every tick travel in the datagram of a tick.
         return sum(share.bytes_per_s for share in shares_at(hz)) + header * hz
 
     total = total_at(rate_hz)
@@ -156,7 +156,7 @@ def _share(row: Stream, rate_hz: float) -> Share:
 
 
 def _hops(link: LinkUri, ways: tuple[Way, ...]) -> tuple[Hop, ...]:
-    """What lies between a sample and its command acting, the two processes' own time left out."""
+    """The hops between a sample and the action of its command, without the computing time of the two processes."""
     capacity = LINKS[link.scheme].capacity(link)
     speed = f"{link.baud} baud" if link.baud else f"{8e-6 * capacity:g} Mbit/s, assumed"
     tick, command = (
@@ -168,11 +168,11 @@ def _hops(link: LinkUri, ways: tuple[Way, ...]) -> tuple[Hop, ...]:
 
 
 def _adapter(link: LinkUri) -> tuple[Hop, ...]:
-    """The wait for more bytes of the USB adapter that receives, where the device is one by its name."""
+    """The time that the receiving USB adapter waits for more bytes, where the device's name shows that it is one."""
     device = Path(link.path).resolve().name if link.path else ""
     if not device.startswith("ttyUSB"):
         return ()
-    note = "at most, with the low latency that is asked for; up to 16 ms where the driver refuses"
+    note = "at most, in low-latency mode; up to 16 ms where the driver refuses that mode"
     with contextlib.suppress(OSError):
         timer = Path(f"/sys/bus/usb-serial/devices/{device}/latency_timer").read_text(encoding="ascii").strip()
         note += f" (latency_timer is {timer} ms now)"
@@ -182,7 +182,7 @@ def _adapter(link: LinkUri) -> tuple[Hop, ...]:
 def _fits_sentence(uri: str, rate_hz: float, ways: tuple[Way, ...]) -> str:
     worst = max(ways, key=lambda way: way.share)
     share = f"{100 * worst.share:.0f}" if worst.share >= 0.01 else "less than 1"
-    return f"{rate_hz:g} Hz fits {uri}: it takes {share} % of the way from {worst.name}"
+    return f"{rate_hz:g} Hz fits {uri}: it takes {share} % of the capacity from {worst.name}"
 
 
 def _refusal(link: LinkUri, rate_hz: float, ways: tuple[Way, ...], highest_hz: int) -> str:
@@ -195,8 +195,8 @@ def _refusal(link: LinkUri, rate_hz: float, ways: tuple[Way, ...], highest_hz: i
     else:
         remedy = f"no rate fits, so choose a faster link{other}"
     return (
-        f"{rate_hz:g} Hz does not fit {link.text}: from {worst.name} it takes {worst.bytes_per_s / 1e3:.1f} kB/s of the "
-        f"{worst.capacity_bytes_per_s / 1e3:.1f} kB/s there are: {remedy}"
+        f"{rate_hz:g} Hz does not fit {link.text}: from {worst.name} it needs {worst.bytes_per_s / 1e3:.1f} kB/s of "
+        f"{worst.capacity_bytes_per_s / 1e3:.1f} kB/s available: {remedy}"
     )
 
 

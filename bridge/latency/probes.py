@@ -1,7 +1,7 @@
-"""Open-loop probes of a link: questions on an absolute schedule, each answer timed from when its question was due.
+"""Open-loop probes of a link: requests on an absolute schedule, each response timed from when its request was due.
 
-A sender that waits for late answers asks less often just when the link is slow, and its figures hide it (coordinated
-omission). These probes never wait: the schedule is absolute, and a question that left late counts from when it was due.
+A sender that waits for late responses sends less often just when the link is slow, and its figures hide that (coordinated
+omission). These probes never wait: the schedule is absolute, and a request that left late is timed from when it was due.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from bridge.process import StopFlag
 from bridge.timing.clock import Clock
 
 Matcher = Callable[[bytes], list[int]]
-"""The numbers of the probes that a received datagram or chunk answers."""
+"""Gives the numbers of the probes that a received datagram or chunk answers."""
 
 
 class ProbeResult(NamedTuple):
-    """What came of the probes; one that was not answered is -1 in both.
+    """Result of the probes; both times of an unanswered one are -1.
 
-    from_due_ns (n,)   answer's arrival less the time its question was due (free of coordinated omission)
-    from_sent_ns (n,)  answer's arrival less the time its question left
-    duplicates, out_of_order, unknown   answers that came again, after a later one's, or to no question
+    from_due_ns (n,)   arrival of the response minus the time its request was due (free of coordinated omission)
+    from_sent_ns (n,)  arrival of the response minus the time its request was sent
+    duplicates, out_of_order, unknown   responses that were repeated, came after a later one's, or match no request
     """
 
     from_due_ns: npt.NDArray[np.int64]
@@ -36,7 +36,7 @@ class ProbeResult(NamedTuple):
 
     @property
     def lost(self) -> int:
-        """Questions without an answer."""
+        """Requests without a response."""
         return int((self.from_due_ns < 0).sum())
 
 
@@ -52,7 +52,7 @@ def probe(
     linger_ns: int = 500_000_000,
     progress: Callable[[int], None] = lambda _sent: None,
 ) -> ProbeResult:
-    """Send question(k) for k = 0 .. count - 1, a period apart, and time the answers; linger for the last ones.
+    """Send question(k) for k = 0 .. count - 1, one per period, and time the responses; wait `linger_ns` for the last ones.
 
     Raises what the link raises, and Interrupted.
     """
@@ -63,7 +63,7 @@ def probe(
     begun_ns = clock.now_ns() + period_ns
     asked = 0
     end_ns = begun_ns
-    # However late it gets, every question is asked: one that was not would count as lost.
+    # Every request is sent, however late: one that was not sent would count as lost.
     while asked < count or (clock.now_ns() < end_ns and (came < 0).any()):
         now_ns = clock.now_ns()
         stop.check()
@@ -92,6 +92,6 @@ def probe(
                 counts["out_of_order"] += number < newest
                 newest = max(newest, number)
     known = came >= 0
-    # A kernel's stamp is taken on the wall clock: were that set meanwhile, an answer must not count as lost.
+    # Kernel stamps use the wall clock: if that was set back meanwhile, the response must not count as lost.
     from_due_ns, from_sent_ns = (np.where(known, np.maximum(came - since, 0), -1) for since in (due, sent))
     return ProbeResult(from_due_ns, from_sent_ns, **counts)

@@ -1,6 +1,6 @@
-"""Answers TIMESYNC on a link until it is told to end: the far end of `fwav-hil latency`'s probes, as an autopilot would be.
+"""Answers TIMESYNC on a link, as an autopilot does: the far end of the probes of `fwav-hil latency`.
 
-`python -m bridge.latency.responder URI` writes the URI it listens on, then answers; it ends with its parent, or by SIGTERM.
+`python -m bridge.latency.responder URI` prints the URI it listens on, then answers until its parent ends or SIGTERM comes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _LOOK_S = 0.1
 
 
 def respond(endpoint: Endpoint, stop: StopFlag) -> None:
-    """Answer every TIMESYNC question until a stop is requested."""
+    """Answer every TIMESYNC request until a stop is requested."""
     clock = MonotonicClock()
     time_sync = TimeSync(endpoint.seal, clock)
     while not stop.requested:

@@ -1,8 +1,7 @@
-"""Where each sample and its command were, and when: rows of time stamps that either end gathers while it runs.
+"""Latency segments: time stamps of each sample and its command, recorded by both ends as rows of a table.
 
-All stamps are of the end's own `MonotonicClock`, ns, and 0 where unknown. A sample is told by its simulation time, which the
-command echoes, so the rows of both ends join; the answers to TIMESYNC say how their clocks relate where they run on two
-machines.
+All stamps are of the end's own `MonotonicClock`, in ns, and 0 where unknown. A sample is identified by its simulation time,
+which the command echoes, so that the rows of both ends can be joined. Between two machines TIMESYNC relates the clocks.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ ANSWER_COLUMNS = ("t_ns", "kernel_ns", "woke_ns", "applied_ns", "acts_ns")
 SAMPLE_COLUMNS = ("t_ns", "kernel_ns", "woke_ns", "computed_ns", "sent_ns")
 """Controller, per sample: received by the kernel; fetched from it; command computed; handed to the link."""
 CLOCK_COLUMNS = ("at_ns", "offset_ns", "round_trip_ns")
-"""Emulator, per answer to TIMESYNC: how far the controller's clock was ahead then, and twice the bound of that."""
+"""Emulator, per answer to TIMESYNC: how far the controller's clock was ahead, and twice the error bound of that."""
 EMULATOR_FILE, CONTROLLER_FILE = "legs_emulator.npz", "legs_controller.npz"
 
 Rows = npt.NDArray[np.int64]
@@ -33,7 +32,7 @@ _BLOCK = 65536
 
 
 class LegTable:
-    """Rows of stamps, in large blocks: adding one allocates nothing as a rule, and never moves those that are there."""
+    """Rows of stamps in large blocks: adding a row rarely allocates memory, and never copies existing rows."""
 
     def __init__(self, columns: tuple[str, ...]) -> None:
         self.columns = columns
@@ -54,12 +53,12 @@ class LegTable:
 
     @property
     def rows(self) -> Rows:
-        """What was added, a row each."""
+        """All rows (n, columns)."""
         return np.vstack([*self._blocks[:-1], self._blocks[-1][: self._count]])
 
 
 def save_legs(path: Path, tables: dict[str, LegTable], clock: Estimate | None) -> None:
-    """Write tables by name, and how far the other end's clock is ahead of this one's. Raises RunFolderError."""
+    """Write tables by name, and the estimated offset of the other end's clock. Raises RunFolderError."""
     offset = (clock.offset_ns, clock.round_trip_ns, clock.answers) if clock else (0, -1, 0)
     try:
         arrays: dict[str, Any] = {name: table.rows for name, table in tables.items()}
@@ -69,9 +68,9 @@ def save_legs(path: Path, tables: dict[str, LegTable], clock: Estimate | None) -
 
 
 def load_legs(path: Path, *names: str) -> tuple[list[Rows], Estimate | None]:
-    """The tables of these names (ticks, answers, samples, clocks), and the clock's estimate; see `save_legs`.
+    """The tables of these names (ticks, answers, samples, clocks) and the clock estimate; see `save_legs`.
 
-    Raises RunFolderError where there is no such file, or not what was written.
+    Raises RunFolderError where the file is missing or damaged.
     """
     try:
         with path.open("rb") as opened, np.load(opened) as file:  # numpy leaves open what it cannot read
@@ -79,7 +78,7 @@ def load_legs(path: Path, *names: str) -> tuple[list[Rows], Estimate | None]:
         offset_ns, round_trip_ns, answers = map(int, arrays["clock"])
         tables = [arrays[name] for name in names]
     except FileNotFoundError:
-        raise RunFolderError(f"there is no {path}: fly the run with --legs, which notes when all was where") from None
+        raise RunFolderError(f"there is no {path}: fly the run with --legs, which records latency segments") from None
     except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
         raise _damaged(path, error) from None
     for name, table in zip(names, tables, strict=True):

@@ -1,1 +1,1 @@
-"""Links: one end of a byte link each, the same face for every transport."""
+"""Links: one end of a byte link, with the same interface for every transport."""

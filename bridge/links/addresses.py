@@ -1,4 +1,4 @@
-"""Network addresses and sockets, and the system's refusals in words that name the link and the remedy."""
+"""Network addresses and sockets, and error messages that name the link and the remedy."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ Address = tuple[Any, ...]
 
 
 def resolve(uri: LinkUri, kind: socket.SocketKind) -> tuple[socket.AddressFamily, Address]:
-    """Return the family and the address of the URI's host, IPv4 where it has both.
+    """Return the address family and the address of the URI's host; IPv4 is preferred where it has both.
 
-    Both ends must come to the same answer for "localhost", and most peers bind it as 127.0.0.1.
+    Both ends must resolve "localhost" to the same address, and most peers bind it as 127.0.0.1.
 
     Raises:
         LinkError: no such host.
     """
     try:
         found = socket.getaddrinfo(uri.host, uri.port, type=kind)
-    except (OSError, UnicodeError) as error:  # UnicodeError: what cannot even be a host name, say with an empty label
+    except (OSError, UnicodeError) as error:  # UnicodeError: not a valid host name, for example with an empty label
         reason = f"cannot resolve host {uri.host!r} ({error})"
         raise LinkError(f"{uri.text}: {reason}: correct the name or write an IP address") from error
     family, _, _, _, address = min(found, key=lambda answer: answer[0] != socket.AF_INET)
@@ -48,9 +48,9 @@ def cannot_bind(uri: LinkUri, error: OSError) -> LinkError:
     if error.errno == errno.EADDRINUSE:
         return LinkInUseError(f"{uri.text}: {place} is taken: stop the other process or choose another with --link")
     if error.errno in (errno.EACCES, errno.EPERM):
-        return LinkError(f"{uri.text}: no permission for {place}: choose a port from 1024 up with --link")
+        return LinkError(f"{uri.text}: no permission for {place}: choose a port of 1024 or more with --link")
     if error.errno == errno.EADDRNOTAVAIL:
-        return LinkError(f"{uri.text}: {uri.host} is no address of this machine: use 127.0.0.1 or one of its own")
+        return LinkError(f"{uri.text}: {uri.host} is not an address of this machine: use 127.0.0.1 or one of its own")
     return LinkError(f"{uri.text}: cannot open {place}: {error}")
 
 

@@ -1,4 +1,4 @@
-"""StreamLink: what TCP and serial lines share, waiting on a file that does not block."""
+"""StreamLink: what TCP and serial links share: waiting on a non-blocking file descriptor."""
 
 from __future__ import annotations
 
@@ -12,38 +12,38 @@ from bridge.timing.clock import MonotonicClock
 from protocol.errors import LinkClosedError, LinkError
 
 CHUNK_BYTES: Final = 65536
-"""The most one `recv` returns."""
+"""Largest number of bytes that one `recv` returns."""
 
 SEND_TIMEOUT_S: Final = 1.0
-"""How long a send waits in all for the other end to make room."""
+"""How long a send waits in total for buffer space."""
 
 
 class StreamLink(Link):
     """A link on a file descriptor in non-blocking mode.
 
-    A transport says how to read and write without blocking, and what to wait on.
+    A transport defines how to read and write without blocking, and which descriptor to wait on.
     """
 
     def __init__(self, uri: str, *, send_timeout_s: float = SEND_TIMEOUT_S) -> None:
-        """Set up what every stream has; `send_timeout_s` bounds each send."""
+        """Set up the common state; `send_timeout_s` bounds each send."""
         super().__init__(uri)
         self._clock = MonotonicClock()
         self._send_timeout_s = send_timeout_s
 
     @abc.abstractmethod
     def _read(self) -> bytes:
-        """Read what is there: BlockingIOError where nothing is, b"" or another OSError where the other end is gone."""
+        """Read available data: BlockingIOError where there is none, b"" or another OSError where the other end is gone."""
 
     @abc.abstractmethod
     def _write(self, data: memoryview) -> int:
-        """Write what there is room for and return how much that was: BlockingIOError where there is none."""
+        """Write as much as fits and return the number of bytes; BlockingIOError where nothing fits."""
 
     @abc.abstractmethod
     def _fileno(self) -> int:
-        """What to wait on; negative once closed."""
+        """The descriptor to wait on; negative once closed."""
 
     def recv(self, timeout_s: float) -> bytes | None:
-        """Return what has come, waiting for its first byte; see `Link.recv`."""
+        """Return the received data, waiting for its first byte; see `Link.recv`."""
         deadline_ns = self._deadline_ns(timeout_s)
         while True:
             try:
@@ -63,10 +63,10 @@ class StreamLink(Link):
                 return data
 
     def send(self, data: bytes | bytearray | memoryview) -> None:
-        """Send all of `data`, waiting at most the link's send timeout for room; see `Link.send`.
+        """Send all of `data`, waiting at most the link's send timeout for buffer space; see `Link.send`.
 
-        After the LinkError of a timeout the other end has a part of `data`: a reader that checks frames finds that one
-        bad and goes on with the next.
+        After the LinkError of a timeout the other end has received a part of `data`: a reader that checks frames drops
+        that frame and continues with the next.
         """
         rest = memoryview(data).cast("B")
         size = len(rest)
@@ -79,7 +79,7 @@ class StreamLink(Link):
                 if remaining_s < SHORTEST_WAIT_S:
                     self.stats.send_failed += 1
                     taken = f"{self.peer} took {size - len(rest)} of {size} bytes in {self._send_timeout_s:g} s"
-                    raise LinkError(f"{self.uri}: {taken}: see that the other end reads, and fast enough") from None
+                    raise LinkError(f"{self.uri}: {taken}: check that the other end reads fast enough") from None
                 self._wait(remaining_s, writable=(self._fileno(),))
             except OSError as error:
                 self.stats.send_failed += 1

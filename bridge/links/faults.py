@@ -1,4 +1,4 @@
-"""Faults put into a link on purpose. A fault is injected; an error is ours."""
+"""Fault injection on a link. A fault is injected on purpose; an error is not."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from bridge.timing.clock import Clock
 from protocol.errors import LinkClosedError
 
 _SPIN_NS = 200_000
-"""The last of a delay is polled through: a sleep would end up to this much late, which would be a delay of its own."""
+"""This last part of a delay is polled: a sleep could end this much too late and so add to the delay."""
 
 _FETCHED_AT_ONCE = 1000
-"""A bound: a peer that floods the link must not keep `recv` from ending."""
+"""A bound, so that `recv` returns even where a peer floods the link."""
 
 
 class DelayedLink(WrappedLink):
-    """A link whose receiving end gets everything later by a fixed wall time, in the order in which it came.
+    """A link whose receiving end gets all data later by a fixed wall time, in order.
 
-    The delay counts from the kernel's receive time where the link tells it, else from when the datagram was fetched. What
-    is counted (`stats`) is what the link itself received and sent; a stamp is that of the arrival, before the delay.
+    The delay counts from the kernel's receive time where the link provides it, else from when the datagram was fetched.
+    `stats` counts what the link itself received and sent; `received_ns` is the time of arrival, before the delay.
     """
 
     def __init__(self, link: Link, delay_ns: int, clock: Clock) -> None:
@@ -31,7 +31,7 @@ class DelayedLink(WrappedLink):
         self._ended_by: LinkClosedError | None = None
 
     def recv(self, timeout_s: float) -> bytes | None:
-        """What the link delivered a delay ago, or None; see `Link.recv`."""
+        """The next datagram whose delay has passed, or None; see `Link.recv`."""
         if timeout_s <= 0.0:
             return self._take_stock()
         give_up_ns = self._clock.now_ns() + round(timeout_s * 1e9)
@@ -45,7 +45,7 @@ class DelayedLink(WrappedLink):
             if self._ended_by and not self._held:
                 raise self._ended_by
             due_ns = self._held[0][0] if self._held else give_up_ns + 1
-            if self._ended_by:  # what the link delivered before it closed is still on its way
+            if self._ended_by:  # data that the link delivered before it closed is still delayed
                 self._clock.sleep_until_ns(min(due_ns, give_up_ns))
             else:
                 until_ns = due_ns - _SPIN_NS if due_ns <= give_up_ns else give_up_ns
@@ -54,7 +54,7 @@ class DelayedLink(WrappedLink):
                 return None
 
     def _take_stock(self) -> bytes | None:
-        """What is due, without a wait, after all that has come is taken in."""
+        """Fetch all received data without waiting; return the first datagram that is due, or None."""
         if self._closed:
             raise LinkClosedError(f"{self.uri} is closed on this end")
         for _ in range(_FETCHED_AT_ONCE):
@@ -68,7 +68,7 @@ class DelayedLink(WrappedLink):
         return None
 
     def _fetch(self, timeout_s: float) -> bool:
-        """Take in what comes to the link next; whether anything came."""
+        """Fetch the link's next datagram into the delay queue; whether one was received."""
         try:
             data = self._link.recv(timeout_s)
         except LinkClosedError as error:
@@ -81,7 +81,7 @@ class DelayedLink(WrappedLink):
         return True
 
     def release_peer(self) -> None:
-        """As the link does; what the last peer's closing left, and what is on its way from it, are forgotten too."""
+        """As the link does; delayed data of the last peer, and its close, are discarded too."""
         self._held.clear()
         self._ended_by = None
         super().release_peer()

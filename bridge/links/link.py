@@ -1,14 +1,14 @@
-"""Link: one end of a byte link, the same face for every transport; and how a URI becomes one.
+"""Link: one end of a byte link, with the same interface for every transport; and how a URI is opened as a link.
 
     udpin://127.0.0.1:14560         waits for a peer          bridge/links/udp.py
-    udpout://127.0.0.1:14560        talks to one
+    udpout://127.0.0.1:14560        sends to one
     tcpin://127.0.0.1:4560          waits for a client        bridge/links/tcp.py
     tcpout://127.0.0.1:4560         connects to a server
     serial:///dev/ttyUSB0:921600    a serial line             bridge/links/serial_port.py
     mem://loop                      inside this process       bridge/links/memory.py
 
-A further transport is one file, one row in LINKS (and, where its URI has another shape, a medium in `parse_link_uri`), and
-a test class that inherits `tests.contracts.link_contract.LinkContract`.
+To add a transport: one file, one row in LINKS (and a medium in `parse_link_uri` where its URI has another form), and a
+test class that inherits `tests.contracts.link_contract.LinkContract`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import Final, Protocol, Self, cast
 from protocol.errors import LinkClosedError, LinkError, LinkUriError
 
 NOBODY: Final = "nobody yet"
-"""What `Link.peer` says before there is a peer."""
+"""Value of `Link.peer` before there is a peer."""
 
 SHORTEST_WAIT_S: Final = 1e-6
 """A timeout below this (negative ones too) counts as 0."""
@@ -33,22 +33,22 @@ SHORTEST_WAIT_S: Final = 1e-6
 
 @dataclass(slots=True)
 class LinkStats:
-    """What a link has counted since it was opened; bytes are those handed over, without the transport's headers."""
+    """Counters of a link since it was opened; bytes are payload bytes, without the transport's headers."""
 
     received: int = 0
     """Datagrams or, on a stream, chunks handed to the caller."""
     received_bytes: int = 0
     sent: int = 0
-    """Sends the system took whole."""
+    """Sends that the system accepted completely."""
     sent_bytes: int = 0
     unknown_peer: int = 0
-    """Datagrams dropped because they came from somebody who is not the peer."""
+    """Datagrams dropped because their sender is not the peer."""
     no_peer: int = 0
     """Sends dropped because there is no peer yet."""
     send_failed: int = 0
-    """Sends dropped because the system refused them: full buffer, too large, nobody listens there."""
+    """Sends dropped because the system refused them: full buffer, too large, no listener at the address."""
     refused: int = 0
-    """Times a receive learned that nobody listens at the peer's port (ECONNREFUSED)."""
+    """Receives that reported no listener at the peer's port (ECONNREFUSED)."""
 
     def as_dict(self) -> dict[str, int]:
         """Return the counters by name, for a summary."""
@@ -58,37 +58,34 @@ class LinkStats:
 class Link(abc.ABC):
     """One end of a byte link.
 
-    A datagram link (`is_datagram`) keeps the bounds of what was sent: one `recv` returns what one `send` was given, or
-    nothing. A stream link returns chunks with arbitrary bounds. Neither waits without a bound. One thread receives and
-    one (the same or another) sends; `close` may come from any, and a `recv` under way then ends by its timeout at the
-    latest.
-
-    A link that wraps another gives its own `stats` and passes the rest on.
+    A datagram link (`is_datagram`) preserves message boundaries: one `recv` returns the data of one `send`, or nothing. A
+    stream link returns chunks with arbitrary boundaries. Every wait is bounded. One thread receives and one (the same or
+    another) sends; any thread may call `close`, and a `recv` in progress then ends by its timeout at the latest.
     """
 
     spin_s: float = 0.0
-    """Poll for this long before sleeping in `recv`: a core kept busy for a quicker hand-over. UDP only; others ignore it."""
+    """Time to poll in `recv` before sleeping: lower latency for a busy core. UDP only; other links ignore it."""
 
     received_ns: int = 0
-    """When the kernel received what `recv` returned last, on `MonotonicClock`; 0 where that is not known."""
+    """When the kernel received the data that `recv` returned last, on `MonotonicClock`; 0 where that is not known."""
 
     def __init__(self, uri: str) -> None:
-        """Set up what every link has; `uri` is how messages name the link."""
+        """Set up the common state; error messages name the link by `uri`."""
         self.uri = uri
         self.stats = LinkStats()
         self._closed = False
 
     @property
     def is_datagram(self) -> bool:
-        """Whether the link keeps the bounds of what was sent."""
+        """Whether the link preserves message boundaries."""
         return scheme_of(self.uri).is_datagram
 
     @abc.abstractmethod
     def recv(self, timeout_s: float) -> bytes | None:
-        """Return the next datagram or chunk, or None where nothing came within `timeout_s` (0 polls).
+        """Return the next datagram or chunk, or None after `timeout_s` without data (0 polls).
 
         Raises:
-            LinkClosedError: this end was closed, or a stream's other end was and all it sent has been returned.
+            LinkClosedError: this end was closed, or a stream's other end was and all its data has been returned.
             LinkError: the system reports that the link broke.
         """
 
@@ -96,16 +93,16 @@ class Link(abc.ABC):
     def send(self, data: bytes | bytearray | memoryview) -> None:
         """Send `data` as one datagram, or append it to the stream.
 
-        A datagram that cannot be sent at once is dropped whole and counted. A stream waits a bounded time for room.
+        A datagram that cannot be sent at once is dropped and counted. A stream waits a bounded time for buffer space.
 
         Raises:
             LinkClosedError: this end was closed, or a stream's other end was.
-            LinkError: a stream's other end took too little for too long.
+            LinkError: a stream's other end did not read fast enough.
         """
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Let go of the port or device; calling it again does nothing."""
+        """Release the port or device; calling it again does nothing."""
 
     @property
     @abc.abstractmethod
@@ -113,9 +110,9 @@ class Link(abc.ABC):
         """A name for the other end, for messages: "127.0.0.1:43210", or NOBODY."""
 
     def stamp_receives(self) -> bool:
-        """Have `received_ns` told from now on; False where the transport or the system cannot.
+        """Set `received_ns` from now on; False where the transport or the system cannot.
 
-        Linux turns its stamps on a moment after it was asked to: until then the stamp is the time of the fetching.
+        Linux enables its stamps shortly after the request: until then the stamp is the time of the fetch.
         """
         return False
 
@@ -127,11 +124,11 @@ class Link(abc.ABC):
         return 0
 
     def counters(self) -> dict[str, int]:
-        """What the link has counted, by name."""
+        """Counters of the link, by name."""
         return self.stats.as_dict()
 
     def release_peer(self) -> None:  # noqa: B027  (most links have nothing to release)
-        """Forget the peer, so that another may take its place; does nothing where the peer is fixed."""
+        """Forget the peer, so that another one can take its place; does nothing where the peer is fixed."""
 
     def __enter__(self) -> Self:
         """Return the link itself."""
@@ -142,7 +139,7 @@ class Link(abc.ABC):
         self.close()
 
     def _broken(self, cause: BaseException) -> LinkError:
-        """The error to raise for `cause`, met while using the link: closing it under a waiting thread ends here too."""
+        """The error to raise for `cause`, an error while using the link; also after another thread closed the link."""
         if self._closed:
             return LinkClosedError(f"{self.uri} is closed on this end")
         return LinkError(f"{self.uri} broke: {cause}")
@@ -150,15 +147,15 @@ class Link(abc.ABC):
 
 @dataclass(frozen=True, slots=True)
 class LinkUri:
-    """A link URI in its parts; a part that the scheme does not have is empty or 0."""
+    """The parts of a link URI; a part that the scheme does not have is empty or 0."""
 
     text: str
-    """The URI as it was written."""
+    """The URI as given."""
     scheme: str
     host: str = ""
-    """IPv6 addresses stand here without their brackets."""
+    """IPv6 addresses without brackets."""
     port: int = 0
-    """0 on a link that waits for its peer: the system chooses."""
+    """0 (only on a link that waits for its peer): the system chooses a port."""
     path: str = ""
     """The serial device."""
     baud: int = 0
@@ -181,15 +178,15 @@ class Medium(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Scheme:
-    """What is known of all links of one scheme.
+    """Properties of all links of one scheme.
 
     opener        "module:callable", which takes a LinkUri and connect_timeout_s; imported when a link is first opened
-    capacity      bytes a second one way, assumed where they are not a matter of the URI
+    capacity      bytes per second one way; an assumed value where the URI does not give it
     is_datagram   see `Link`
-    counterpart   scheme of the other end's URI, which is the same but for that
-    waits         whether this end waits for the other one to come, so that it needs no address of it
-    header_bytes  that each datagram or segment costs besides
-    port          proposed in messages
+    counterpart   scheme of the other end's URI, which is otherwise the same
+    waits         whether this end waits for its peer, and so needs no address of it
+    header_bytes  overhead of each datagram or segment
+    port          port that error messages propose
     """
 
     opener: str
@@ -205,9 +202,9 @@ class Scheme:
 BITS_PER_BYTE = 10
 """On a serial line: start bit, eight data bits, stop bit."""
 ETHERNET_BYTES_PER_S = 12.5e6
-"""Assumed of a network: 100 Mbit/s."""
+"""Assumed for a network: 100 Mbit/s."""
 MEMORY_BYTES_PER_S = 1e9
-"""Assumed of this machine's own memory."""
+"""Assumed for this machine's own memory."""
 _LOOPBACK = ("127.", "localhost", "::1")
 _ETHERNET_FRAME = 38  # preamble 8, addresses and type 14, check 4, gap 12
 
@@ -249,7 +246,7 @@ LINKS: Final[Mapping[str, Scheme]] = MappingProxyType(
     }
 )
 
-_DEFAULT_HOST = "127.0.0.1"  # never all interfaces unless asked: who reaches the port can move the vehicle
+_DEFAULT_HOST = "127.0.0.1"  # all interfaces only on request: anyone who reaches the port can move the vehicle
 _PROPOSED_LINK = "udpin://127.0.0.1:14560"
 _PROPOSED_SERIAL = "serial:///dev/ttyUSB0:921600"
 _HOST_AND_PORT = re.compile(r"(?:\[(?P<ipv6>[^\[\]\s]+)\]|(?P<host>[^\[\]:/@?#\s]*))(?::(?P<port>[^:]*))?")
@@ -263,8 +260,8 @@ def open_link(uri: str, *, connect_timeout_s: float = 10.0) -> Link:
     `connect_timeout_s` bounds the wait for a server at a `tcpout` address; no other link waits when it is opened.
 
     Raises:
-        LinkUriError: the URI names no link.
-        LinkInUseError: the port, device or name is taken.
+        LinkUriError: the URI is not valid.
+        LinkInUseError: the port, device or name is in use.
         LinkError: no permission, no such device, no such host.
         PeerMissingError: nothing listens at a `tcpout` address.
     """
@@ -275,10 +272,10 @@ def open_link(uri: str, *, connect_timeout_s: float = 10.0) -> Link:
 
 
 def parse_link_uri(text: str) -> LinkUri:
-    """Take a link URI apart without opening anything.
+    """Parse a link URI without opening anything.
 
     Raises:
-        LinkUriError: the URI names no link; the message says why and shows one that does.
+        LinkUriError: the URI is not valid; the message says why and shows a valid one.
     """
     scheme, _, rest = text.partition("://")
     medium = scheme_of(text).medium
@@ -286,7 +283,7 @@ def parse_link_uri(text: str) -> LinkUri:
         return _parse_serial(text, rest)
     if medium is Medium.MEMORY:
         if not re.fullmatch(r"[\w.-]+", rest):
-            raise _bad(text, "the name must be of letters, digits, '.', '_' and '-'", "mem://loop")
+            raise _bad(text, "the name may only contain letters, digits, '.', '_' and '-'", "mem://loop")
         return LinkUri(text, scheme, name=rest)
     return _parse_network(text, scheme, rest)
 
@@ -301,7 +298,7 @@ def scheme_of(text: str) -> Scheme:
 
 
 def counterpart(text: str) -> str:
-    """The URI by which the other end of a link opens it; of a serial line, whose device has another name there, its form.
+    """The URI with which the other end opens a link; on a serial line only its form, since the device name there differs.
 
     Raises LinkUriError.
     """
@@ -309,7 +306,7 @@ def counterpart(text: str) -> str:
 
 
 def _parse_serial(text: str, rest: str) -> LinkUri:
-    path, _, baud = rest.rpartition(":")  # the last colon: names under /dev/serial/by-path hold colons themselves
+    path, _, baud = rest.rpartition(":")  # the last colon: names under /dev/serial/by-path contain colons themselves
     if not path.startswith("/"):
         raise _bad(text, "it must name a device by its full path, then ':' and the baud rate", _PROPOSED_SERIAL)
     if not _is_number(baud) or int(baud) == 0:
@@ -321,7 +318,7 @@ def _parse_network(text: str, scheme: str, rest: str) -> LinkUri:
     proposed = LINKS[scheme].port
     parts = _HOST_AND_PORT.fullmatch(rest)
     if parts is None:
-        reason = "it must be a host, ':' and a port, an IPv6 address in brackets"
+        reason = "it must be a host, ':' and a port, with an IPv6 address in brackets"
         raise _bad(text, reason, f"{scheme}://{_DEFAULT_HOST}:{proposed} or {scheme}://[::1]:{proposed}")
     host = parts["ipv6"] or parts["host"] or _DEFAULT_HOST
     example = f"{scheme}://{join_address(host, proposed)}"
@@ -331,7 +328,7 @@ def _parse_network(text: str, scheme: str, rest: str) -> LinkUri:
     if not _is_number(port) or len(port) > _LARGEST_PORT_DIGITS or int(port) > _LARGEST_PORT:
         raise _bad(text, f"the port {port!r} is not a whole number up to {_LARGEST_PORT}", example)
     if int(port) == 0 and not LINKS[scheme].waits:
-        raise _bad(text, "port 0 (the system chooses) makes sense only where a link waits for its peer", example)
+        raise _bad(text, "port 0 (the system chooses) is allowed only on a link that waits for its peer", example)
     return LinkUri(text, scheme, host=host, port=int(port))
 
 
@@ -345,4 +342,4 @@ def _is_number(text: str) -> bool:
 
 
 def _bad(text: str, reason: str, example: str) -> LinkUriError:
-    return LinkUriError(f"{text!r} names no link: {reason}; write for example {example}")
+    return LinkUriError(f"{text!r} is not a link URI: {reason}; write for example {example}")

@@ -1,4 +1,4 @@
-"""A link inside one process: both ends by one name, or as a pair. For tests, and to run both ends in one process."""
+"""A link inside one process, opened by name or as a pair. For tests, and to run both ends in one process."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from bridge.links.link import NOBODY, SHORTEST_WAIT_S, Link, LinkUri
 from protocol.errors import LinkClosedError, LinkInUseError
 
 QUEUE_LIMIT: Final = 4096
-"""Datagrams that may wait at one end; further ones are dropped and counted by the sender, as UDP would do."""
+"""Datagrams queued at one end; further ones are dropped, as by UDP, and counted by the sender."""
 
 _PAIR = "pair"
 
 
 @dataclass(slots=True)
 class _Wire:
-    """What both ends share. In a queue None says that the link is closed, and stays there."""
+    """State shared by both ends. None in a queue means that the link is closed, and stays there."""
 
     name: str
     queues: tuple[SimpleQueue[bytes | None], SimpleQueue[bytes | None]] = field(
@@ -28,17 +28,17 @@ class _Wire:
     closed: int = 0
 
 
-# The one piece of module state in bridge/: two opens of one name must meet, and a name is all they have in common. A
-# name stands here from its first open until the last end that was opened is closed.
+# The only module state in bridge/: two opens of one name must find each other, and have only the name in common. A
+# name is kept from its first open until the last opened end is closed.
 _wires: dict[str, _Wire] = {}
 _wires_lock = threading.Lock()
 
 
 def open_memory(uri: LinkUri, *, connect_timeout_s: float = 0.0) -> MemoryLink:
-    """Open the next free end of the link of that name; `connect_timeout_s` is every link's and has no meaning here.
+    """Open the next free end of the link of that name; `connect_timeout_s` is ignored.
 
     Raises:
-        LinkInUseError: both ends have been opened, and not all of them closed.
+        LinkInUseError: both ends have been opened, and not both closed.
     """
     with _wires_lock:
         wire = _wires.setdefault(uri.name, _Wire(uri.name))
@@ -50,7 +50,7 @@ def open_memory(uri: LinkUri, *, connect_timeout_s: float = 0.0) -> MemoryLink:
 
 
 def memory_pair() -> tuple[MemoryLink, MemoryLink]:
-    """Return both ends of a new link, which has no name and so meets nobody else."""
+    """Return both ends of a new link without a name, which nothing else can open."""
     wire = _Wire("")
     return _next_end(wire), _next_end(wire)
 
@@ -64,13 +64,13 @@ def _next_end(wire: _Wire) -> MemoryLink:
 class MemoryLink(Link):
     """One end, from `open_memory` or `memory_pair`; every method may be called from any thread.
 
-    Datagrams arrive in order and none is lost, but: sends before the other end is open are dropped and counted
-    (`no_peer`), as are those beyond QUEUE_LIMIT waiting ones or after the other end was closed (`send_failed`). After a
-    close of the other end `recv` returns what is still waiting, then raises LinkClosedError.
+    Datagrams arrive in order and none is lost, with these exceptions: sends before the other end is open (counted as
+    `no_peer`), with QUEUE_LIMIT datagrams queued, or after the other end was closed (`send_failed`) are dropped. After the
+    other end was closed `recv` returns what is still queued, then raises LinkClosedError.
     """
 
     def __init__(self, wire: _Wire, end: int) -> None:
-        """End 0 (the first opened) or 1 of a wire."""
+        """Take end 0 (opened first) or 1 of a wire."""
         super().__init__(f"mem://{wire.name or _PAIR}")
         self._wire = wire
         self._name = "AB"[end]
@@ -117,7 +117,7 @@ class MemoryLink(Link):
             if self._wire.closed == self._wire.opened and _wires.get(self._wire.name) is self._wire:
                 del _wires[self._wire.name]
         self._outgoing.put(None)
-        self._incoming.put(None)  # wakes a thread of ours that waits
+        self._incoming.put(None)  # wakes a thread that waits in `recv`
 
     @property
     def peer(self) -> str:

@@ -1,7 +1,7 @@
 """A serial line: 8 data bits, no parity, 1 stop bit, no flow control, raw. POSIX.
 
-pyserial knows how to open and set up the line; reading and writing go straight to its file, because pyserial's `write`
-waits for more room after all is written, and setting its `timeout` sets the whole line up again.
+pyserial opens and configures the line; reads and writes use its file descriptor directly, because pyserial's `write` waits
+for buffer space even after all is written, and setting its `timeout` configures the whole line again.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from protocol.errors import LinkError, LinkInUseError, LinkUriError
 
 
 class SerialLink(StreamLink):
-    """One end of a serial line, for this process alone (other programs that ask for the lock are refused).
+    """One end of a serial line, locked for this process (other programs that ask for the lock are refused).
 
-    `low_latency` says whether the driver agreed to hand bytes on at once: USB adapters otherwise hold them for up to
-    16 ms, which is too long for a control loop.
+    `low_latency` tells whether the driver accepted low-latency mode: without it USB adapters hold bytes back for up to
+    16 ms, too long for a control loop.
 
-    Raises LinkInUseError where the device is taken, LinkUriError where it does not know the baud rate, LinkError where
-    there is no such device, it is no serial line or not allowed.
+    Raises LinkInUseError where the device is in use, LinkUriError where it does not support the baud rate, LinkError where
+    there is no such device, it is not a serial line or access is not permitted.
     """
 
     def __init__(self, uri: LinkUri, *, connect_timeout_s: float = 0.0, send_timeout_s: float = SEND_TIMEOUT_S) -> None:
-        """Open the device; `connect_timeout_s` is every link's and has no meaning here."""
+        """Open the device; `connect_timeout_s` is ignored."""
         super().__init__(uri.text, send_timeout_s=send_timeout_s)
         self._device = uri.path
         try:
@@ -37,13 +37,13 @@ class SerialLink(StreamLink):
             raise _cannot_open(uri, error) from error
         except (ValueError, OverflowError) as error:
             raise LinkUriError(
-                f"{uri.text!r} names no link: {uri.path} does not know {uri.baud} baud ({error}); write for example "
+                f"{uri.text!r} is not a link URI: {uri.path} does not support {uri.baud} baud ({error}); write for example "
                 f"serial://{uri.path}:921600"
             ) from error
         self.low_latency = _ask_for_low_latency(self._port)
 
     def _read(self) -> bytes:
-        # Asked first, because on a raw line with nothing waiting a read returns b"", as it does on one that is gone.
+        # Check first: without data a read of a raw line returns b"", the same as on a line that is gone.
         if not select.select((self._fileno(),), (), (), 0)[0]:
             raise BlockingIOError
         return os.read(self._fileno(), CHUNK_BYTES)
@@ -57,13 +57,13 @@ class SerialLink(StreamLink):
         return int(self._port.fileno())
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Release the device."""
         self._closed = True
         self._port.close()
 
     @property
     def peer(self) -> str:
-        """The device: who is at the other end of the wire cannot be known."""
+        """The device: the other end of a serial line has no name."""
         return self._device
 
 
@@ -80,6 +80,6 @@ def _cannot_open(uri: LinkUri, error: serial.SerialException) -> LinkError:
 def _ask_for_low_latency(port: serial.Serial) -> bool:
     try:
         port.set_low_latency_mode(True)
-    except (OSError, ValueError, NotImplementedError):  # most lines that are not USB have no such thing
+    except (OSError, ValueError, NotImplementedError):  # most lines that are not USB have no such mode
         return False
     return True

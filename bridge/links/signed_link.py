@@ -1,7 +1,6 @@
-"""A link whose frames are signed: what is sent gets a signature, what is received must have a good one.
+"""A link with MAVLink signatures: sent frames are signed, received frames must carry a valid signature.
 
-The ends of the loop see plain frames, as the record does: a signature is of the way, like a header, and the loop's compiled
-kernels take signed ticks as any others. A link without a key is not touched by any of this.
+The ends of the loop and the log see unsigned frames: signatures are added and removed here, as a transport adds headers.
 """
 
 from __future__ import annotations
@@ -14,12 +13,12 @@ from protocol.wire.signing import Signatures, Verdict, strip
 
 
 class SignedLink(WrappedLink):
-    """A link with a key (32 bytes). Its peer is forgotten again where its first words are not believed.
+    """A link with a signing key (32 bytes). A peer whose first frames have no valid signature is released again.
 
     dropped   unsigned        frames without a signature
-              bad_signature   frames whose signature another key made, or that were changed on their way
-              old_signature   frames that were said before (a recording, a late copy), or by a clock a minute behind
-              unsealed        what was no intact frame, or of a message that is not known
+              bad_signature   frames signed with another key, or changed on the way
+              old_signature   replayed or repeated frames, or a sender's clock that is a minute behind
+              unsealed        damaged frames, or frames of an unknown message
     """
 
     def __init__(self, link: Link, key: bytes) -> None:
@@ -32,7 +31,7 @@ class SignedLink(WrappedLink):
         self._dropped = dict.fromkeys(("unsigned", "bad_signature", "old_signature", "unsealed"), 0)
 
     def recv(self, timeout_s: float) -> bytes | None:
-        """The believed frames of the next datagram or chunk, without their signatures; see `Link.recv`."""
+        """The frames of the next datagram or chunk with valid signatures, which are removed; see `Link.recv`."""
         give_up_ns = self._clock.now_ns() + round(max(0.0, timeout_s) * 1e9)
         while True:
             data = self._link.recv(timeout_s)
@@ -59,26 +58,26 @@ class SignedLink(WrappedLink):
         if plain:
             self._is_believed = True
         elif not self._is_believed and self.is_datagram:
-            self._link.release_peer()  # a stranger that came first must not keep the place
+            self._link.release_peer()  # an unknown sender that came first must not stay the peer
         return b"".join(plain)
 
     def counters(self) -> dict[str, int]:
-        """What the link has counted, and by cause what was dropped; damaged frames get no further than here."""
+        """Counters of the link, and dropped frames by cause; damaged frames are dropped here."""
         read = self._incoming.counters
         damaged = sum(read[cause] for cause in ("bad_crc", "truncated", "unknown_flags", "mavlink1"))
         return {**super().counters(), **self._dropped, "unsealed": self._dropped["unsealed"] + damaged}
 
     def send(self, data: bytes | bytearray | memoryview) -> None:
-        """Send the frames of `data`, each signed anew."""
+        """Sign each frame in `data` and send them."""
         now_us = unix_time_us()
         self._link.send(b"".join(self._signatures.sign(one.raw, now_us) for one in self._outgoing.read(bytes(data))))
 
     def release_peer(self) -> None:
-        """As the link does; whoever comes next must be believed anew."""
+        """As the link does; the next peer must show a valid signature first."""
         self._is_believed = False
         super().release_peer()
 
 
 def signed(link: Link, key: bytes | None) -> Link:
-    """The link with signatures, or as it is where there is no key."""
+    """The link with signatures, or the link itself where there is no key."""
     return SignedLink(link, key) if key else link

@@ -1,4 +1,4 @@
-"""TCP: TcpIn waits for one client, TcpOut connects to a server. Both send at once (TCP_NODELAY)."""
+"""TCP: TcpIn waits for one client, TcpOut connects to a server. Both send without delay (TCP_NODELAY)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bridge.links.link import NOBODY, SHORTEST_WAIT_S, LinkUri, join_address
 from protocol.errors import PeerMissingError
 
 _RETRY_PERIOD_S = 0.05
-_ATTEMPT_TIMEOUT_S = 1.0  # a host that swallows the attempt is asked again, in case it has come up since
+_ATTEMPT_TIMEOUT_S = 1.0  # after an attempt without any response it tries again, in case the host has come up since
 
 
 class _TcpLink(StreamLink):
@@ -42,9 +42,9 @@ class _TcpLink(StreamLink):
 
 
 class TcpOut(_TcpLink):
-    """Connects to a server, which may start later: it is tried until `connect_timeout_s` has passed.
+    """Connects to a server, which may start later: it retries until `connect_timeout_s` has passed.
 
-    Raises PeerMissingError where nothing answers by then, LinkError where the host cannot be resolved.
+    Raises PeerMissingError where no server has accepted by then, LinkError where the host cannot be resolved.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class TcpOut(_TcpLink):
             self._clock.sleep_until_ns(self._deadline_ns(min(_RETRY_PERIOD_S, remaining_s)))
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self._closed = True
         self._hang_up()
 
@@ -86,7 +86,7 @@ def _failed_connect(connection: socket.socket, address: Address, timeout_s: floa
     try:
         connection.settimeout(timeout_s)
         connection.connect(address)
-        # An attempt at a free port of this machine may by chance leave from that very port and so meet itself.
+        # Connecting to a free port of this machine may by chance use that same port as source, and so connect to itself.
         if connection.getsockname() != connection.getpeername():
             return None
         reason = "nobody listens"
@@ -100,22 +100,22 @@ def _failed_connect(connection: socket.socket, address: Address, timeout_s: floa
 
 
 class TcpIn(_TcpLink):
-    """Waits on a port for one client; others stay in the system's queue until `release_peer`.
+    """Listens on a port for one client; others stay in the system's queue until `release_peer`.
 
     The client is accepted within `recv`: until then sends are dropped and counted. Once the client has closed, `recv`
-    and `send` raise LinkClosedError until `release_peer`. `port` is the port it waits on, also where the URI said 0.
+    and `send` raise LinkClosedError until `release_peer`. `port` is the port it listens on, also where the URI gave 0.
 
-    Raises LinkInUseError where the port is taken, LinkError where the address is not this machine's or not allowed.
+    Raises LinkInUseError where the port is in use, LinkError where the address is not this machine's or not permitted.
     """
 
     def __init__(self, uri: LinkUri, *, connect_timeout_s: float = 0.0, send_timeout_s: float = SEND_TIMEOUT_S) -> None:
-        """Listen; `connect_timeout_s` is every link's and has no meaning here."""
+        """Listen; `connect_timeout_s` is ignored."""
         super().__init__(uri.text, send_timeout_s=send_timeout_s)
         family, address = resolve(uri, socket.SOCK_STREAM)
         self._peer = NOBODY
         self._listener = new_socket(uri, family, socket.SOCK_STREAM)
         try:
-            # So that a restart need not wait for the last run's connections to be forgotten; a second listener fails.
+            # Lets a restart bind while old connections are in TIME_WAIT; a second listener still fails.
             self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._listener.setblocking(False)
             self._listener.bind(address)
@@ -127,7 +127,7 @@ class TcpIn(_TcpLink):
         self.uri = f"{uri.scheme}://{join_address(uri.host, self.port)}"
 
     def recv(self, timeout_s: float) -> bytes | None:
-        """Accept a client if there is none, then return what it has sent, within `timeout_s` in all."""
+        """Accept a client if there is none, then return data from it, within `timeout_s` in total."""
         if self._connection is None:
             deadline_ns = self._deadline_ns(timeout_s)
             if not self._accept(deadline_ns):
@@ -148,7 +148,7 @@ class TcpIn(_TcpLink):
         while True:
             try:
                 connection, address = self._listener.accept()
-            except (BlockingIOError, ConnectionAbortedError):  # nobody, or gone before it was let in
+            except (BlockingIOError, ConnectionAbortedError):  # no client, or one that left before it was accepted
                 remaining_s = self._remaining_s(deadline_ns)
                 if remaining_s < SHORTEST_WAIT_S:
                     return False
@@ -161,12 +161,12 @@ class TcpIn(_TcpLink):
                 return True
 
     def release_peer(self) -> None:
-        """Hang up on the client; the next `recv` accepts another."""
+        """Disconnect the client; the next `recv` accepts another."""
         self._hang_up()
         self._peer = NOBODY
 
     def close(self) -> None:
-        """Hang up and let go of the port."""
+        """Disconnect the client and release the port."""
         self._closed = True
         self.release_peer()
         self._listener.close()

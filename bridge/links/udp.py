@@ -1,15 +1,14 @@
-"""UDP: UdpIn waits on a port and answers whoever writes first; UdpOut talks to one address.
+"""UDP: UdpIn listens on a port and replies to the first sender; UdpOut sends to one address.
 
-How they wait. A round trip inside one machine takes some ten microseconds, so each system call counts. A timeout of
-8 ms or more first blocks in the receive itself (one call), under a kernel timer (SO_RCVTIMEO) set once, at opening.
-That timer counts in jiffies: asked for one, it takes one to two, which is up to 8 ms at CONFIG_HZ=250 (2 ms at 1000,
-20 ms at 100). What remains after it, and every shorter timeout, is waited for with select: exact to the scheduler's
-delay, for one call more. So no timeout is late by a jiffy (but one of 8 to 20 ms at CONFIG_HZ=100), and none costs a
-setsockopt.
+Waiting. A round trip inside one machine takes some ten microseconds, so each system call counts. A timeout of 8 ms or
+more first blocks in the receive itself (one call), with a kernel timeout (SO_RCVTIMEO) set once, when the link is opened.
+That timeout counts in jiffies: a request for one takes one to two, up to 8 ms at CONFIG_HZ=250 (2 ms at 1000, 20 ms at
+100). The rest of the time, and every shorter timeout, is waited for with select: exact to the scheduler's delay, for one
+more call. So no timeout is late by a jiffy (except one of 8 to 20 ms at CONFIG_HZ=100), and none needs a setsockopt.
 
-Signals. Python runs its handler at once and then starts the interrupted receive over. A handler that only sets a flag
-delays the end of `recv` by 8 ms at most. A signal that comes more often than that, for long, would hold off the end of
-a wait of 8 ms or more for as long; data still ends it at once.
+Signals. Python runs the handler at once and then restarts the interrupted receive. A handler that only sets a flag delays
+the end of `recv` by 8 ms at most. Signals that keep coming more often than that would extend a wait of 8 ms or more for
+as long as they come; data still ends it at once.
 
 Python's own socket timeout (settimeout) would poll before every receive and count in whole milliseconds.
 """
@@ -39,10 +38,10 @@ _INODE = 9
 """The field of a line there that tells the socket; the last one is what was dropped."""
 _BLOCKING_WAIT_S = 0.008
 _ONE_JIFFY = struct.pack("@ll", 0, 1000)  # struct timeval of 1 ms; the kernel rounds up to a jiffy
-_SO_TIMESTAMPNS = 35  # as option and as type of the control message; not among Python's names
+_SO_TIMESTAMPNS = 35  # socket option and type of its control message; Python's socket module does not define it
 _TIMESPEC = struct.Struct("@ll")
 _STAMP_SPACE = socket.CMSG_SPACE(_TIMESPEC.size)
-_DROPS_PER_RECV = 1000  # strangers' datagrams that one recv clears away once its time is up; the next goes on
+_DROPS_PER_RECV = 1000  # datagrams of other senders that one recv drops after its timeout; the next recv continues
 
 
 class _UdpLink(Link):
@@ -66,7 +65,7 @@ class _UdpLink(Link):
         return self._is_stamped
 
     def _receive_stamped(self, flags: int) -> tuple[bytes, Address]:
-        """A datagram and its sender, the kernel's stamp of it noted."""
+        """A datagram and its sender; sets `received_ns` to the kernel's stamp."""
         data, ancillary, _, sender = self._socket.recvmsg(LARGEST_DATAGRAM_BYTES, _STAMP_SPACE, flags)
         self.received_ns = 0
         for level, kind, value in ancillary:
@@ -77,7 +76,7 @@ class _UdpLink(Link):
 
     @abc.abstractmethod
     def _take(self, flags: int) -> bytes | None:
-        """One receive: a datagram of the peer, or None where what came was none and has been counted."""
+        """One receive: a datagram of the peer, or None where it was dropped and counted."""
 
     def recv(self, timeout_s: float) -> bytes | None:
         """Return the next datagram of the peer, or None; see `Link.recv`."""
@@ -133,7 +132,7 @@ class _UdpLink(Link):
         return next((int(fields[-1]) for fields in lines if len(fields) > _INODE and fields[_INODE] == inode), 0)
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Release the port."""
         self._closed = True
         self._socket.close()
 
@@ -153,20 +152,20 @@ class _UdpLink(Link):
 
 
 class UdpIn(_UdpLink):
-    """Waits on a port; the sender of the first datagram is the peer until `release_peer`, and others are dropped.
+    """Listens on a port; the sender of the first datagram is the peer until `release_peer`, and others are dropped.
 
-    `port` is the port it waits on, also where the URI said 0.
+    `port` is the port it listens on, also where the URI gave 0.
 
-    Raises LinkInUseError where the port is taken, LinkError where the address is not this machine's or not allowed.
+    Raises LinkInUseError where the port is in use, LinkError where the address is not this machine's or not permitted.
     """
 
     def __init__(self, uri: LinkUri, *, connect_timeout_s: float = 0.0) -> None:
-        """Bind the port; `connect_timeout_s` is every link's and has no meaning here."""
+        """Bind the port; `connect_timeout_s` is ignored."""
         family, address = resolve(uri, socket.SOCK_DGRAM)
         super().__init__(uri, family)
         self._peer: Address | None = None
         try:
-            self._socket.bind(address)  # without SO_REUSEADDR: two simulations on one port must not go unnoticed
+            self._socket.bind(address)  # without SO_REUSEADDR: a second simulation on the same port must fail
         except OSError as error:
             self.close()
             raise cannot_bind(uri, error) from error
@@ -198,7 +197,7 @@ class UdpIn(_UdpLink):
             self._count_failed_send(error)
 
     def release_peer(self) -> None:
-        """Forget the peer: the next to send a datagram takes its place."""
+        """Forget the peer: the sender of the next datagram becomes the peer."""
         self._peer = None
 
     @property
@@ -208,16 +207,16 @@ class UdpIn(_UdpLink):
 
 
 class UdpOut(_UdpLink):
-    """Talks to one address; what others send does not reach it (the kernel filters, uncounted).
+    """Sends to one address; datagrams of other senders do not reach it (the kernel drops them, uncounted).
 
-    While nobody listens there, the system says so once per datagram that was sent: `refused` where a receive meets the
-    answer, `send_failed` where the next send does, which drops that datagram.
+    While nothing listens there, the system reports an error for each datagram sent: counted as `refused` where a receive
+    gets it, or as `send_failed` where the next send does, which drops that datagram.
 
     Raises LinkError where the host cannot be resolved or reached.
     """
 
     def __init__(self, uri: LinkUri, *, connect_timeout_s: float = 0.0) -> None:
-        """Choose the address, without a word to it; `connect_timeout_s` is every link's and has no meaning here."""
+        """Set the address without sending anything; `connect_timeout_s` is ignored."""
         family, address = resolve(uri, socket.SOCK_DGRAM)
         super().__init__(uri, family)
         self._peer = name_of(address)

@@ -1,4 +1,4 @@
-"""What every link that wraps another passes on as it is."""
+"""Base of links that wrap another link."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from bridge.links.link import Link
 
 
 class WrappedLink(Link):
-    """A link in front of another one: `recv` is its own, the rest is that link's until it says otherwise."""
+    """A link in front of another one: a subclass defines `recv`; all else is passed on unless it is overridden."""
 
     def __init__(self, link: Link) -> None:
         super().__init__(link.uri)
@@ -28,7 +28,7 @@ class WrappedLink(Link):
         self._link.spin_s = value
 
     def send(self, data: bytes | bytearray | memoryview) -> None:
-        """Send at once."""
+        """Send without delay."""
         self._link.send(data)
 
     def stamp_receives(self) -> bool:
@@ -40,7 +40,7 @@ class WrappedLink(Link):
         return self._link.dropped_by_system()
 
     def close(self) -> None:
-        """Close the link; what is on its way is lost."""
+        """Close the link; data still held is lost."""
         self._closed = True
         self._link.close()
 

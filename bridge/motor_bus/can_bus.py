@@ -1,12 +1,12 @@
-"""A CAN bus by URI, over python-can: frames in, frames out, everything counted, reopened when it goes away.
+"""A CAN bus by URI, over python-can: sends and receives frames with counters, and reopens a lost interface.
 
     udp_multicast:239.74.163.2             between processes of this machine; :PORT and ?hop_limit=N may follow
     virtual:name                           inside this process
     socketcan:can0                         the kernel's (its bit rate is set there)
     slcan:/dev/ttyACM0                     a serial adapter
 
-Multicast never leaves the host unless ?hop_limit= says so. On it every sender hears itself: what comes back just as it was
-sent is dropped. Only classical frames are spoken.
+Multicast leaves the host only with ?hop_limit=. On multicast each sender also receives its own frames: these echoes are
+dropped. Only classical frames are supported.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from protocol.errors import CanBusLostError, LinkClosedError, LinkError, LinkUri
 DEFAULT_PORT: Final = 43113
 REOPEN_PERIOD_NS: Final = 500_000_000
 LOST_AFTER_NS: Final = 10_000_000_000
-"""An interface that could not be reopened for this long is given up."""
+"""An interface that could not be reopened for this long is an error."""
 
 _BUS_OFF = 0x40  # CAN_ERR_BUSOFF in the identifier of an error frame (linux/can/error.h)
 _ECHOES = 256
 _MOST_LOOKS = 1000
-"""In one receive whose time is up, for something that is for the caller."""
+"""Frames that one receive looks at after its timeout, searching for one to return."""
 _EXAMPLES: Final = {
     "udp_multicast": "udp_multicast:239.74.163.2",
     "virtual": "virtual:motors",
@@ -39,7 +39,7 @@ _EXAMPLES: Final = {
 
 
 class CanUri(NamedTuple):
-    """A bus URI in its parts, as python-can takes them."""
+    """The parts of a bus URI, as python-can takes them."""
 
     text: str
     interface: str
@@ -49,21 +49,21 @@ class CanUri(NamedTuple):
 
 
 def parse_can_uri(text: str) -> CanUri:
-    """Take a bus URI apart without opening anything. Raises LinkUriError, which shows one that is right."""
+    """Parse a bus URI without opening anything. Raises LinkUriError, which shows a valid one."""
     interface, _, rest = text.partition(":")
     if interface not in _EXAMPLES:
-        raise LinkUriError(f"{text!r} names no CAN bus: write for example {', '.join(_EXAMPLES.values())}")
+        raise LinkUriError(f"{text!r} is not a CAN bus URI: write for example {', '.join(_EXAMPLES.values())}")
     example = _EXAMPLES[interface]
     if interface != "udp_multicast":
         if not rest or any(character.isspace() for character in rest):
-            raise LinkUriError(f"{text!r} names no CAN bus: the channel is missing; write for example {example}")
+            raise LinkUriError(f"{text!r} is not a CAN bus URI: the channel is missing; write for example {example}")
         return CanUri(text, interface, rest)
     parts = re.fullmatch(
         r"(?P<group>[0-9.]+|\[[0-9a-fA-F:]+\])(:(?P<port>\d{1,5}))?(\?hop_limit=(?P<hops>\d{1,3}))?", rest
     )
     if parts is None or int(parts["port"] or 1) not in range(1, 65536) or int(parts["hops"] or 0) > 255:
         raise LinkUriError(
-            f"{text!r} names no CAN bus: it must be a multicast group, then a port and a hop limit if need be; "
+            f"{text!r} is not a CAN bus URI: it must be a multicast group, with an optional port and hop limit; "
             f"write for example {example} or {example}:{DEFAULT_PORT}?hop_limit=1"
         )
     return CanUri(
@@ -72,15 +72,15 @@ def parse_can_uri(text: str) -> CanUri:
 
 
 class CanBus:
-    """One participant of a bus. One thread uses it.
+    """One node on a bus, for use by one thread.
 
     counters   can_sent, can_received        frames
-               can_send_failed               frames dropped because the interface refused them or is away
-               can_bad_frames                what came and was no frame: bytes of somebody else on the multicast port
-               can_fd_frames                 frames of CAN FD, which is not spoken here
+               can_send_failed               frames dropped because the interface refused them or is lost
+               can_bad_frames                received data that is not a CAN frame, such as foreign multicast datagrams
+               can_fd_frames                 frames of CAN FD, which is not supported
                can_error_frames              reported by the interface
-               can_bus_off, can_lost         times the interface went bus-off, or away
-               can_reopened                  times it came back
+               can_bus_off, can_lost         times the interface went bus-off, or was lost
+               can_reopened                  times it was reopened
     """
 
     def __init__(self, uri: str, bitrate: int, clock: Clock | None = None) -> None:
@@ -109,12 +109,12 @@ class CanBus:
             self._bus: Any = self._open()
         except (can.CanError, OSError, ImportError, ValueError) as error:
             raise LinkError(
-                f"cannot open the CAN bus {uri}: {_reason(error)}; see that it exists, or choose another"
+                f"cannot open the CAN bus {uri}: {_reason(error)}; check that it exists, or choose another"
             ) from None
 
     @property
     def trouble(self) -> str:
-        """Why the interface is away just now; empty where it is not."""
+        """Why the interface is lost now; empty where it works."""
         return "" if self._lost_ns is None else self._why
 
     def _open(self) -> Any:
@@ -127,7 +127,7 @@ class CanBus:
         return can.Bus(**arguments, ignore_config=True)
 
     def send(self, frame: CanFrame) -> None:
-        """Put a frame on the bus; dropped and counted while the interface is away. Raises LinkClosedError, CanBusLostError."""
+        """Send a frame; dropped and counted while the interface is lost. Raises LinkClosedError, CanBusLostError."""
         if self._away():
             self.counters["can_send_failed"] += 1
             return
@@ -138,7 +138,7 @@ class CanBus:
             self._bus.send(message)
         except (can.CanError, OSError) as error:
             self.counters["can_send_failed"] += 1
-            if not isinstance(error, can.CanTimeoutError):  # a full queue empties again
+            if not isinstance(error, can.CanTimeoutError):  # a full queue is temporary
                 self._lose(error, "can_lost")
             return
         self.counters["can_sent"] += 1
@@ -146,7 +146,7 @@ class CanBus:
             self._echoes.append(frame)
 
     def recv(self, timeout_s: float) -> CanFrame | None:
-        """The next frame of somebody else, None where none came within timeout_s. Raises LinkClosedError, CanBusLostError."""
+        """The next frame of another node, None after timeout_s without one. Raises LinkClosedError, CanBusLostError."""
         deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         while True:
             if self._away():
@@ -159,7 +159,7 @@ class CanBus:
                 return None
 
     def _receive(self, deadline_ns: int) -> CanFrame | None:
-        """The next frame that is for the caller; None where none came in time, or the interface had something to report."""
+        """The next frame to return to the caller; None at the deadline, or where the interface reported an error."""
         looks = 0
         while True:
             remaining_ns = max(0, deadline_ns - self._clock.now_ns())
@@ -173,7 +173,7 @@ class CanBus:
                 if cause is None or isinstance(cause, OSError):
                     self._lose(error, "can_lost")
                     return None
-                self.counters["can_bad_frames"] += 1  # a datagram that is none of python-can's
+                self.counters["can_bad_frames"] += 1  # a datagram that python-can did not send
                 continue
             if message is None:
                 return None
@@ -193,7 +193,7 @@ class CanBus:
             return frame
 
     def _is_echo(self, frame: CanFrame) -> bool:
-        """Whether a frame is one of ours come back; the ones before it, which then were lost, are forgotten."""
+        """Whether a frame is the echo of one that we sent; earlier ones, whose echoes were lost, are forgotten."""
         echoes = self._echoes
         if not echoes or frame not in echoes:
             return False
@@ -202,7 +202,7 @@ class CanBus:
         return True
 
     def _away(self) -> bool:
-        """Whether the interface is away; tries now and then to open it again."""
+        """Whether the interface is lost; tries to reopen it every REOPEN_PERIOD_NS."""
         if self._closed:
             raise LinkClosedError(f"{self.uri.text} is closed on this end")
         if self._lost_ns is None:
@@ -216,8 +216,8 @@ class CanBus:
             self._why = _reason(error)
             if now_ns - self._lost_ns > LOST_AFTER_NS:
                 raise CanBusLostError(
-                    f"the CAN bus {self.uri.text} was lost and did not come back within "
-                    f"{LOST_AFTER_NS // 1_000_000_000} s: {self._why}; see the interface and its cable"
+                    f"the CAN bus {self.uri.text} was lost and could not be reopened within "
+                    f"{LOST_AFTER_NS // 1_000_000_000} s: {self._why}; check the interface and its cable"
                 ) from None
             self._reopen_ns = now_ns + REOPEN_PERIOD_NS
             return True
@@ -236,10 +236,10 @@ class CanBus:
         try:
             self._bus.shutdown()
         except (can.CanError, OSError):
-            return  # it is gone; what it held goes with it
+            return  # it is lost already
 
     def close(self) -> None:
-        """Let go of the interface; calling it again does nothing."""
+        """Release the interface; calling it again does nothing."""
         if not self._closed:
             self._closed = True
             if self._lost_ns is None:
@@ -253,7 +253,7 @@ class CanBus:
 
 
 def _reason(error: BaseException) -> str:
-    """What the system said, in one line."""
+    """The system's error message, in one line."""
     cause = error.__cause__ or error
     text = getattr(cause, "strerror", None) or str(cause)
     return " ".join(text.split())

@@ -1,13 +1,12 @@
-"""How full a CAN bus gets, and how long a frame waits for it: reckoned before a run, refused where it cannot fit.
+"""Load of a CAN bus and waiting time of its frames, calculated before a run; a run that does not fit is refused.
 
 Load is bits on the wire at worst stuffing, over the bit rate. The wait is the worst response time of each frame by the
 fixed-priority analysis of Davis, Burns, Bril, Lukkien (Real-Time Systems 35, 2007, sufficient test, eq. 13): a frame
-waits for the longest frame that may just have begun, then for every frame of a lower identifier that comes meanwhile,
+waits for the longest frame that may just have begun, then for every frame of a lower identifier that becomes ready meanwhile,
 
     w = max(B, C) + sum over higher priority k of ceil((w + one bit) / T_k) C_k,        response = w + C
 
-with periods T and durations C. The frames of the simulation (`motor_lockstep`) would not be there on hardware and are left
-out.
+with periods T and durations C. Frames that exist in simulation only (`simulation_sync`) are not counted.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from protocol.scenario import NANOSECONDS, Motor
 
 BITRATES: Final = (125_000, 250_000, 500_000, 1_000_000)
 RATES_HZ: Final = (1000, 800, 625, 500, 400, 250, 200, 125, 100, 50, 25, 20, 10)
-"""Control rates to propose: their periods are whole microseconds."""
+"""Control rates that error messages propose: their periods are whole microseconds."""
 
 
 class _Message(NamedTuple):
@@ -33,12 +32,12 @@ class _Message(NamedTuple):
 
 
 def load(kinds: Sequence[Traffic], bitrate: int) -> float:
-    """Share of the bus that the traffic takes at worst stuffing; above 1 it does not fit."""
+    """Fraction of the bus capacity that the traffic takes at worst stuffing; above 1 it does not fit."""
     return sum(kind.bits * kind.rate_hz * kind.number for kind in kinds) / bitrate
 
 
 def worst_response_s(kinds: Sequence[Traffic], bitrate: int) -> float:
-    """From the moment the torques are handed over until the last drive has its command, at worst; inf where it is endless."""
+    """Worst time (s) from handing over the torques until the last drive has its command; inf where it is unbounded."""
     messages = sorted(
         _Message(_priority(kind, i), kind.bits / bitrate, 1.0 / kind.rate_hz, kind.command)
         for kind in kinds
@@ -48,7 +47,7 @@ def worst_response_s(kinds: Sequence[Traffic], bitrate: int) -> float:
 
 
 def _priority(kind: Traffic, index: int) -> tuple[int, int, int]:
-    """Sorts as arbitration does: 11 bits first, a standard frame before an extended one with the same, then 18 bits."""
+    """Sort key as in arbitration: 11 bits first, a standard frame before an extended one with the same, then 18 bits."""
     can_id = kind.can_id + index * kind.step
     return (can_id >> 18, 1, can_id & 0x3FFFF) if kind.extended else (can_id, 0, 0)
 
@@ -68,13 +67,13 @@ def _response_s(at: int, messages: list[_Message], bit_s: float) -> float:
 
 
 class BusPlan(NamedTuple):
-    """What a protocol asks of the bus at a control rate."""
+    """Load and response time that a protocol causes on the bus at a control rate."""
 
     protocol: str
     rate_hz: float
     bitrate: int
     loads: dict[int, float]
-    """share at worst stuffing, by bit rate"""
+    """load (fraction of capacity) at worst stuffing, by bit rate"""
     response_s: float
     """worst time until the last drive has its command, at `bitrate`"""
 
@@ -89,7 +88,7 @@ class BusPlan(NamedTuple):
 
 
 def plan_bus(protocol: str, motor: Motor, rate_hz: float) -> BusPlan:
-    """Reckon the bus for torques at rate_hz. Raises UsageError where it does not fit, saying what does."""
+    """Calculate the bus load for torques at rate_hz. Raises UsageError where it does not fit, naming what does."""
     kinds = traffic(protocol, motor, rate_hz)
     loads = {bitrate: load(kinds, bitrate) for bitrate in sorted({*BITRATES, motor.bitrate})}
     share = loads[motor.bitrate]
@@ -104,11 +103,11 @@ def plan_bus(protocol: str, motor: Motor, rate_hz: float) -> BusPlan:
 
 def _what_fits(protocol: str, motor: Motor, rate_hz: float, loads: dict[int, float]) -> str:
     faster = [bitrate for bitrate, share in loads.items() if bitrate > motor.bitrate and share <= 1.0]
-    remedies = [f"motor.bitrate {faster[0]} does ({100.0 * loads[faster[0]]:.0f} %)"] if faster else []
+    remedies = [f"motor.bitrate {faster[0]} fits ({100.0 * loads[faster[0]]:.0f} %)"] if faster else []
     for rate in RATES_HZ:
         share = load(traffic(protocol, motor, rate), motor.bitrate)
         if rate < rate_hz and share <= 1.0:
-            remedies.append(f"{rate} Hz does ({100.0 * share:.0f} %)")
+            remedies.append(f"{rate} Hz fits ({100.0 * share:.0f} %)")
             break
     return " and ".join(remedies) or "lower the rates of the scenario's [motor] table"
 

@@ -1,7 +1,7 @@
-"""The motor bus of a run, recorded in a format that python-can reads back: .blf, .log (candump), .asc, .csv by suffix.
+"""Recording of a run's motor bus in a format that python-can reads back: .blf, .log (candump), .asc, .csv by suffix.
 
-Stamps are the run's own time: simulation time in lockstep and real time alike, so that the log lies beside the tlog.
-candump's .log has them 1 s later: can-utils' log2asc takes second 0 for no time at all.
+Stamps are simulation time, in lockstep and in real time, as in the tlog.
+candump's .log has them 1 s later, because can-utils' log2asc takes second 0 for no time at all.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ CANDUMP_START_NS: Final = NANOSECONDS
 
 
 def check_record(path: Path) -> None:
-    """Raise UsageError where python-can has no writer for the file's suffix, RunFolderError where the file is there."""
+    """Raise UsageError where python-can has no writer for the file's suffix, RunFolderError where the file exists."""
     if path.suffix.lower() not in SUFFIXES:
-        raise UsageError(f"the bus cannot be recorded to {path}: choose a name that ends in {', '.join(SUFFIXES)}")
+        raise UsageError(f"cannot record the bus to {path}: choose a name that ends in {', '.join(SUFFIXES)}")
     if path.exists():
-        raise RunFolderError(f"{path} exists already, and stays: choose another name for the record of the bus")
+        raise RunFolderError(f"{path} exists already and is not overwritten: choose another name for the bus log")
 
 
 class CanRecorder:
-    """Keeps frames until `settle`, which is called where there is time.
+    """Collects frames; `settle`, called outside the time-critical part of a tick, writes them.
 
-    Where the disk refuses, RunFolderError is raised; with `tell`, that hears of it once instead, and the record ends there.
+    A write error raises RunFolderError; with `tell`, that is called once with the message instead, and the log ends there.
     """
 
     def __init__(self, path: Path, tell: Callable[[str], None] | None = None) -> None:
@@ -49,12 +49,12 @@ class CanRecorder:
             raise self._refused(error) from None
 
     def watch(self, t_ns: int, frame: CanFrame) -> None:
-        """Have a frame recorded under a time (ns)."""
+        """Record a frame with its time (ns)."""
         if not self._is_full:
             self._owed.append((t_ns, frame))
 
     def settle(self) -> None:
-        """Write what is owed."""
+        """Write the collected frames."""
         try:
             for t_ns, frame in self._owed:
                 self._writer.on_message_received(
@@ -73,7 +73,7 @@ class CanRecorder:
             self._owed.clear()
 
     def close(self) -> None:
-        """Write what is owed and close."""
+        """Write the collected frames and close the file."""
         self.settle()
         try:
             self._writer.stop()
@@ -82,11 +82,11 @@ class CanRecorder:
 
     def _give_up(self, error: OSError) -> None:
         if self._is_full:
-            return  # said already
+            return  # reported already
         self._is_full = True
         if self._tell is None:
             raise self._refused(error) from None
         self._tell(str(self._refused(error)))
 
     def _refused(self, error: OSError) -> RunFolderError:
-        return RunFolderError(f"cannot write the record of the bus {self.path}: {error.strerror}")
+        return RunFolderError(f"cannot write the bus log {self.path}: {error.strerror}")

@@ -1,7 +1,7 @@
-"""The tap: a CAN bus shown to a MAVLink station, and its frames put on the bus, while it asks for that.
+"""The tap: forwards CAN frames between the motor bus and a MAVLink station, while the station requests it.
 
-Source: MAVLink common message set. MAV_CMD_CAN_FORWARD (32000), parameter 1: the bus from 1 on, 0 ends it; the request must
-be renewed, since forwarding stops 5 s after the last. CAN_FRAME (386): bus from 0 on, bit 31 of the identifier marks 29
+Source: MAVLink common message set. MAV_CMD_CAN_FORWARD (32000), parameter 1: number of the bus, counted from 1; 0 stops.
+Forwarding stops 5 s after the last request. CAN_FRAME (386): bus counted from 0; bit 31 of the identifier marks 29
 bits, bit 30 a remote frame. Stations: `dronecan`'s mavcan driver, the DroneCAN GUI, MAVProxy.
 """
 
@@ -26,13 +26,13 @@ _MOST_AT_ONCE = 64
 
 
 class CanTap:
-    """The tap of one station at a time on one bus.
+    """The tap on one bus, for one station at a time.
 
-    A station that hangs up, takes nothing or has not renewed its request for 5 s makes room for another. Whatever its link
-    does, the flight goes on.
+    A station that disconnects, does not read or has not renewed its request for 5 s is replaced by the next one. Errors of
+    its link never end the run.
 
-    counters   tap_sent       frames shown       tap_taken     frames of the station, for the bus
-               tap_requests   times forwarding was asked for or renewed    tap_refused   frames and requests not for this bus
+    counters   tap_sent       frames sent to the station          tap_taken     frames of the station sent on the bus
+               tap_requests   requests and renewals of forwarding tap_refused   frames and requests not for this bus
     """
 
     def __init__(self, link: Link, component: int, clock: Clock) -> None:
@@ -48,20 +48,20 @@ class CanTap:
 
     @property
     def forwarding(self) -> bool:
-        """Whether a station has asked for the bus within the last 5 s."""
-        is_same = self._station.departures == self._departures  # who comes next must ask for itself
+        """Whether a station has requested the bus within the last 5 s."""
+        is_same = self._station.departures == self._departures  # the next station must send its own request
         return self._until_ns is not None and is_same and self._clock.now_ns() < self._until_ns
 
     def watch(self, _t_ns: int, frame: CanFrame) -> None:
-        """Show a frame of the bus to the station, if it wants that."""
+        """Send a frame of the bus to the station, while forwarding is on."""
         if frame in self._theirs:
-            self._theirs.remove(frame)  # what the station said itself
+            self._theirs.remove(frame)  # the station sent it itself
         elif self.forwarding:
             self._station.say(mapping.CAN_FRAME, mapping.encode_can_frame(frame))
             self.counters["tap_sent"] += 1
 
     def poll(self) -> list[CanFrame]:
-        """Take what the station says, without waiting; returns its frames for the bus."""
+        """Handle the station's messages without waiting; returns its frames for the bus."""
         frames: list[CanFrame] = []
         if self._until_ns is not None and not self.forwarding:
             self._until_ns = None

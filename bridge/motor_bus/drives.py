@@ -1,18 +1,18 @@
-"""The emulator's end of the motor bus: torques out as CAN frames, the force behind the gears back.
+"""The emulator's end of the motor bus: sends torques as CAN frames and receives the force u at the gear output.
 
-Each command goes out as the protocol's frames, then a SYNC that gives the drives the time; six answers bring u.
+Each command is sent as the protocol's frames, followed by a SYNC with the time; six ANSWER frames return u.
 
-In lockstep simulation time stands still until all six have answered: the same bytes go out again after 10, 20, 40 ms ..., and
-after 8 s of wall time the run ends. Drives that were started again meanwhile are met again: they answer the very
-tick that was waited for, disabled and at the safe output, and are enabled with the next one. So the plant sees an outage of one
-tick, whatever the wait was, and the result depends on the tick alone at which the drives were lost.
+In lockstep simulation time stands still until all six drives have answered: the same bytes are sent again after 10, 20,
+40 ms ..., and after 8 s of wall time the run ends. Drives that were restarted meanwhile answer the tick in progress,
+disabled and at the safe output, and are enabled with the next one. So the plant sees an outage of one tick, however long
+the wait was, and the result depends only on the tick at which the drives were lost.
 
-In real time an answer is waited for shortly, and the last u is held. After `actuators.staleness_s` without answers that is an
-outage, counted: the plant gets the safe output until the drives answer, and they are enabled again. 10 s without them
-disarm and end the run.
+In real time the wait for an answer is short, and the last u is held. After `actuators.staleness_s` without answers an
+outage is counted: the plant gets the safe output until the drives answer and are enabled again. After 10 s without answers
+the run is disarmed and ends.
 
-feedback "bus" takes u from the protocol's own status frames, where they carry the position of the output shaft, as it was
-when they were sent: what an encoder behind the gear would give. In real time there is then no SYNC at all, as on hardware.
+With feedback "bus" u comes from the protocol's own status frames, if they carry the output shaft position, as it was when
+they were sent: as from an encoder at the gear output. In real time no SYNC is then sent at all, as on hardware.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from protocol.motors.simulation_sync import ALL_AXES, TICKS
 from protocol.scenario import NANOSECONDS, Scenario
 
 ENABLE_AGAIN_NS = NANOSECONDS // 10
-"""Of simulation time, between two tries to enable drives that are not."""
+"""Simulation time between two attempts to enable drives that are not enabled."""
 GIVE_UP_NS = 10 * NANOSECONDS
 """In real time: an outage this long ends the run."""
 HELLO_S = 0.1
@@ -57,20 +57,20 @@ RESEND_AFTER_S = (0.010, 0.020, 0.040, 0.080, 0.160, 0.320, *(0.640,) * 11, 0.33
 LONG_WAIT_S = 0.5
 
 Watch = Callable[[int, CanFrame], None]
-"""Is told of each frame on the bus and the time (ns) it belongs to: a recorder, the tap."""
+"""Called with the time (ns) of each frame on the bus, and the frame: a recorder, the tap."""
 
 
 class CanMotors:
     """Six drives behind a bus, for the emulator.
 
     counters   motor_resent        commands sent again because not all drives had answered
-               motor_outages       times the drives were gone; in lockstep, times they were met again in the middle of a run
-               motor_outage_ticks  ticks without them: none in lockstep
-               motor_recoveries    times all of them followed again     motor_safe_ticks     ticks with a drive not enabled
-               motor_enables       times the drives were told to follow torques
-               motor_late_answers  answers to an earlier tick, and copies
+               motor_outages       outages of the drives; in lockstep, restarts of the drives during a run
+               motor_outage_ticks  ticks without answers: none in lockstep
+               motor_recoveries    times all were enabled again         motor_safe_ticks     ticks with a drive not enabled
+               motor_enables       attempts to enable the drives
+               motor_late_answers  answers to an earlier tick, and duplicates
                motor_faults        status frames that report a latched fault
-               bus_bits            bits of all frames but those of the simulation, their stuffing counted
+               bus_bits            bits of all frames, with stuffing, except those that exist in simulation only
                and those of the bus and of `motor_protocol.Cause`
     """
 
@@ -104,7 +104,7 @@ class CanMotors:
         self.watches: list[Watch] = []
         self.poll: list[Callable[[], None]] = []
         self.on_long_wait: list[Callable[[], None]] = []
-        """Called now and then while a tick's answer is long in coming, so that others who wait for us can be told."""
+        """Called during a long wait for answers, so that other peers that wait for us can be informed."""
         self.tap_counters: dict[str, int] = {}
         self._now_ns = 0
         self.delay_ns = response_ns(plan) if scenario.motor.bus_delay else 0
@@ -126,7 +126,7 @@ class CanMotors:
         self._begun = False
         self._tau = np.array(scenario.initial.command)
         self.velocities: FloatArray = np.zeros(DRIVES)
-        """(6,) how fast the drives said that they turn, rad/s."""
+        """(6,) speeds that the drives reported last, rad/s."""
         self._coming: deque[tuple[int, FloatArray]] = deque()
         names = ("resent", "outages", "outage_ticks", "recoveries", "safe_ticks", "enables", "late_answers", "faults")
         self._counters = {
@@ -137,17 +137,17 @@ class CanMotors:
 
     @property
     def counters(self) -> dict[str, int]:
-        """Everything counted, by name."""
+        """All counters, by name."""
         return {**self._counters, **self._bus.counters, **self.tap_counters}
 
     def inject(self, frames: list[CanFrame]) -> None:
-        """Put frames of somebody else, a station on the tap, on the bus."""
+        """Send the frames of a station on the tap on the bus."""
         for frame in frames:
             self._bus.send(frame)
             self._note(self._now_ns, frame)
 
     def summary(self, duration_s: float) -> dict[str, Any]:
-        """What a run's summary says of the bus: loads planned, and measured over the simulated (or real) duration_s."""
+        """The bus in a run's summary: planned loads, and loads measured over the simulated (or real) duration_s."""
         bits = self._counters["bus_bits"] / duration_s if duration_s else 0.0
         measured = {str(bitrate): 100.0 * bits / bitrate for bitrate in self._plan.loads}
         return {"uri": self._bus.uri.text, **self._plan.as_dict(), "measured_load_percent": measured}
@@ -185,10 +185,10 @@ class CanMotors:
         )
 
     def drive(self, t_ns: int, tau: FloatArray, acts_ns: int) -> FloatArray:
-        """Command tau (6,) at time t_ns; returns the force behind the gears u (6,), which acts from acts_ns on.
+        """Command tau (6,) at time t_ns; returns the force u (6,) at the gear output, which acts from acts_ns on.
 
-        Raises PeerLostError where the drives are gone for good, ScenarioMismatchError where others took their place,
-        CanBusLostError where the bus is gone, Interrupted.
+        Raises PeerLostError where the drives do not come back, ScenarioMismatchError where drives with another scenario
+        took their place, CanBusLostError where the bus is lost, Interrupted.
         """
         self._coming.append((acts_ns, tau.copy()))
         self._now_ns = t_ns
@@ -196,17 +196,17 @@ class CanMotors:
         if self._ask(t_ns, self._frames(t_ns, tau)):
             self._arrived(t_ns)
         elif self._lockstep:
-            trouble = f" (the interface is away: {self._bus.trouble})" if self._bus.trouble else ""
+            trouble = f" (the interface is lost: {self._bus.trouble})" if self._bus.trouble else ""
             raise PeerLostError(
-                f"the drives on {self._bus.uri.text} gave no answer to the tick at t = {t_ns * 1e-9:.3f} s for "
-                f"{sum(self._waits_s):.0f} s{trouble}: see whether they still run, or start them again with {self._command}"
+                f"the drives on {self._bus.uri.text} did not answer the tick at t = {t_ns * 1e-9:.3f} s for "
+                f"{sum(self._waits_s):.0f} s{trouble}: check whether they still run, or restart them with {self._command}"
             )
         else:
             self._missed(t_ns)
         return self._u.copy()
 
     def _ask(self, t_ns: int, frames: list[CanFrame]) -> bool:
-        """Send the frames of a tick, in lockstep again and again; whether all six have answered."""
+        """Send the frames of a tick, repeatedly in lockstep; whether all six have answered."""
         waits = deque(self._waits())
         restarts = self._stop.peer_restarts
         first = True
@@ -227,29 +227,29 @@ class CanMotors:
             if self._collect(t_ns, wait_s):
                 return True
             first = False
-            if self._stop.peer_restarts != restarts:  # a process that is just starting gets the whole time
+            if self._stop.peer_restarts != restarts:  # a process that was just started gets the full timeout
                 restarts = self._stop.peer_restarts
                 waits = deque(self._waits())
         return False
 
     @property
     def _command(self) -> str:
-        """What starts the drives."""
+        """The command line that starts the drives."""
         return f"`fwav-hil motor SCENARIO --can {self._bus.uri.text} --protocol {self._plan.protocol}`"
 
     def tau_at(self, t_ns: int) -> FloatArray:
-        """The torques asked for that are in action at t_ns (6,); times must not decrease."""
+        """The commanded torques (6,) that act at t_ns; times must not decrease."""
         while self._coming and self._coming[0][0] <= t_ns:
             self._tau = self._coming.popleft()[1]
         return self._tau
 
     def close(self) -> None:
-        """Let the drives go."""
+        """Disable the drives."""
         try:
             for frame in self._host.disable():
                 self._bus.send(frame)
         except FwavHilError:
-            return  # the bus may be what ended the run
+            return  # the bus itself may have failed
 
     def _frames(self, t_ns: int, tau: FloatArray) -> list[CanFrame]:
         frames = self._host.cyclic(t_ns)
@@ -266,7 +266,7 @@ class CanMotors:
         return self._waits_s if self._lockstep else (min(SHORT_WAIT_S, 0.25e-9 * self._scenario.period_ns),)
 
     def _collect(self, t_ns: int, wait_s: float) -> bool:
-        """Take frames until all six have answered the SYNC of t_ns, or none came any more; whether they have."""
+        """Handle frames until all six have answered the SYNC of t_ns or the wait ends; whether all have answered."""
         tick = t_ns // self._scenario.period_ns % TICKS
         deadline_ns = self._clock.now_ns() + round(wait_s * NANOSECONDS)
         while True:
@@ -278,7 +278,7 @@ class CanMotors:
                 return False
             answer = simulation_sync.decode_answer(frame)
             if answer is None:
-                if self._begun or not self._syncs:  # what drives said in their own time is not of this run
+                if self._begun or not self._syncs:  # frames sent before the first SYNC are not part of this run
                     self._note(t_ns, frame)
                 self._take(t_ns, frame)
             elif answer.tick != tick:
@@ -300,8 +300,8 @@ class CanMotors:
                 return False
 
     def _take(self, t_ns: int, frame: CanFrame) -> None:
-        """Learn from a frame that is no answer."""
-        if self._begun and self._is_hello(frame):  # drives that join: what others had answered is void
+        """Handle a frame that is not an ANSWER."""
+        if self._begun and self._is_hello(frame):  # restarted drives: earlier answers to this tick are void
             self._hello_ns = t_ns
             self._answered = self._answered_enabled = 0
         if simulation_sync.is_simulation_only(frame):
@@ -314,11 +314,11 @@ class CanMotors:
             self._learn(status)
 
     def _is_hello(self, frame: CanFrame) -> bool:
-        """Whether drives say HELLO. Raises ScenarioMismatchError where it is of another scenario."""
+        """Whether the frame is a HELLO of drives. Raises ScenarioMismatchError where it has another digest."""
         theirs = simulation_sync.decode_hello(frame, drives=True)
         if theirs is not None and theirs != self._digest:
             raise ScenarioMismatchError(
-                f"the drives hold another scenario (digest {theirs.hex()}, here {self._digest.hex()}): start both with the "
+                f"the drives run another scenario (digest {theirs.hex()}, here {self._digest.hex()}): start both with the "
                 "same scenario file, --protocol and --lag"
             )
         return theirs is not None
@@ -339,7 +339,7 @@ class CanMotors:
             self._bus_u[status.axis] = status.position / travel * self._scale[status.axis]
 
     def _heard_all(self) -> bool:
-        """Without SYNC: whether each drive has said something since this was last so."""
+        """Without SYNC: whether every drive has sent a status since this was last true."""
         self._u = self._bus_u.copy()
         if self._heard != ALL_AXES:
             return False
@@ -347,7 +347,7 @@ class CanMotors:
         return True
 
     def _arrived(self, t_ns: int) -> None:
-        """All six have answered."""
+        """Update state and counters after all six have answered."""
         self._answered_ns = t_ns
         self._all_enabled = self._enabled == ALL_AXES
         joined = self._lockstep and self._hello_ns == t_ns and not self._enabled
@@ -364,7 +364,7 @@ class CanMotors:
             self._counters["motor_recoveries"] += 1
 
     def _missed(self, t_ns: int) -> None:
-        """In real time: the drives have not answered in time."""
+        """In real time: handle a tick without answers in time."""
         now_ns = self._clock.now_ns()
         if self._out_ns is None:
             limit_ns = round(self._scenario.actuators.staleness_s * NANOSECONDS)
@@ -379,8 +379,8 @@ class CanMotors:
         self._u = self._safe_u.copy()
         if now_ns - self._out_ns > GIVE_UP_NS:
             raise PeerLostError(
-                f"the drives on {self._bus.uri.text} fell silent and did not come back within "
-                f"{GIVE_UP_NS // NANOSECONDS} s (t = {t_ns * 1e-9:.3f} s): the run is disarmed; see whether they still run"
+                f"the drives on {self._bus.uri.text} stopped answering and did not come back within "
+                f"{GIVE_UP_NS // NANOSECONDS} s (t = {t_ns * 1e-9:.3f} s): the run is disarmed; check whether they still run"
             )
 
     def _note(self, t_ns: int, frame: CanFrame) -> None:

@@ -1,1 +1,1 @@
-"""Recording and replay of what passes over a link."""
+"""Recording and replay of the frames on a link."""

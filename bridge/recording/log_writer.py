@@ -1,8 +1,8 @@
-"""The process that writes a log while the loop goes on: it empties a ring into a file until its parent closes its input.
+"""The process that writes a log while the loop runs: it copies a ring buffer to a file until its parent closes its stdin.
 
-`python -m bridge.recording.log_writer RING CAPACITY FILE`, the first and the last being inherited file descriptors. It
-looks 50 times a second, at an ordinary priority and on any core, whatever its parent's are. When its standard input
-ends, which a kill -9 of the parent brings about too, it writes the rest and ends: 0, or 1 where the file did not take all.
+`python -m bridge.recording.log_writer RING CAPACITY FILE`; RING and FILE are inherited file descriptors. It polls 50 times
+per second, at ordinary priority and on any core, whatever the parent's settings. When its standard input ends (also after
+a kill -9 of the parent) it writes the rest and exits with 0, or with 1 where not all could be written.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ PERIOD_S = 0.02
 
 
 def drain(ring: ByteRing, file: int) -> bool:
-    """Empty the ring until standard input ends; whether the file took all."""
+    """Copy the ring to the file until standard input ends; whether all was written."""
     seen = 0
     while not select.select([sys.stdin], [], [], PERIOD_S)[0]:
         ring.write_to(file, seen)
@@ -28,7 +28,7 @@ def drain(ring: ByteRing, file: int) -> bool:
 
 
 def become_ordinary() -> None:
-    """Undo what a real-time parent hands down, and outlive its signals: a Ctrl-C is the parent's to answer."""
+    """Undo real-time settings inherited from the parent, and ignore stop signals: only the parent handles Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     if sys.platform == "linux":
@@ -36,7 +36,7 @@ def become_ordinary() -> None:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
             os.sched_setaffinity(0, range(os.cpu_count() or 1))
         except OSError:
-            return  # where it is not allowed to, it was not raised either
+            return  # without permission to change them, the parent's settings were ordinary too
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What both recorders do alike: a sidecar from the first moment to the last, and one sentence about a disk that refuses."""
+"""What both recorders share: a sidecar from the beginning to the end of the log, and one message on a write error."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Tell = Callable[[str], None]
 
 
 class SidecarLog(TlogWriter):
-    """A log with its sidecar; how frames get to the disk is the recorder's own.
+    """A log with its sidecar; subclasses define how frames are written.
 
-    sidecar   what the sidecar will hold; a caller may add to its "counters" until `close`
-    lost      frames that are not, or will not be, in the log
+    sidecar   content of the sidecar; a caller may add to its "counters" until `close`
+    lost      frames that are missing from the log
     """
 
     def __init__(
@@ -30,7 +30,7 @@ class SidecarLog(TlogWriter):
         source: dict[str, Any],
         tell: Tell | None,
     ) -> None:
-        """Open the log; see `new_sidecar`. Raises RunFolderError where that is not possible."""
+        """Open the log; see `new_sidecar`. Raises RunFolderError where that fails."""
         super().__init__(path)
         self.sidecar = new_sidecar(path, links, stamps=stamps, source=source)
         self.lost = 0
@@ -39,7 +39,7 @@ class SidecarLog(TlogWriter):
 
     @contextlib.contextmanager
     def _beginning(self) -> Iterator[None]:
-        """Write the sidecar, and whatever else a recorder begins with in the block; where it fails, no log is left behind."""
+        """Write the sidecar, then run the block with the recorder's own setup; after an error no log is left behind."""
         try:
             write_sidecar(self.path, self.sidecar)
             yield
@@ -51,7 +51,7 @@ class SidecarLog(TlogWriter):
             raise RunFolderError(f"cannot begin the log {self.path}: {reason}") from None
 
     def _end(self, problem: str, **content: Any) -> None:
-        """Have the sidecar say how the log ended, and tell the user of a problem that has not been told."""
+        """Write the end of the log to the sidecar, and report a problem that was not reported before."""
         self.sidecar |= {"complete": self.lost == 0, "lost": self.lost, **content}
         try:
             write_sidecar(self.path, self.sidecar)
@@ -61,7 +61,7 @@ class SidecarLog(TlogWriter):
             self._say(problem)
 
     def _say(self, sentence: str) -> None:
-        """Tell what the disk refused, the first time: to `tell`, or by raising RunFolderError."""
+        """Report the first write error: to `tell`, or by raising RunFolderError."""
         if self._told:
             return
         self._told = True

@@ -1,6 +1,6 @@
-"""Playing a log in time: each frame at its moment, at any speed; held, stepped and moved while it plays.
+"""Timed playback of a log: each frame at its time, at any speed; with pause, single step and seek.
 
-The schedule is absolute, so lateness never adds up: a frame is due at the start plus its log time over the speed.
+The schedule is absolute, so lateness never accumulates: a frame is due at the start plus its log time over the speed.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import numpy.typing as npt
 from bridge.timing.clock import Clock
 
 LOOK_PERIOD_NS = 20_000_000
-"""How often the keyboard, the link's other direction and a wish to stop are looked at."""
+"""How often the keyboard, the link's other direction and stop requests are polled."""
 LOOK_ROOM_NS = 1_000_000
-"""A look that would begin so shortly before a frame is due waits until that frame has gone ..."""
+"""A poll due this shortly before a frame is postponed until after that frame ..."""
 LATEST_LOOK_NS = 80_000_000
-"""... but no longer than this, however densely frames come."""
+"""... but no longer than this, however dense the frames are."""
 LARGEST_MOMENT = 64
-"""Most frames of one stamp that are made ready together."""
+"""Largest number of frames with the same stamp that are prepared together."""
 
 _DAY_NS = 86_400_000_000_000
 _LATEST_US = 1 << 52
@@ -31,7 +31,7 @@ Times = npt.NDArray[np.int64]
 
 
 def log_times_ns(stamps_us: Times, max_gap_s: float | None = None) -> Times:
-    """Log time (n,) of each frame since the first, ns: gaps beyond max_gap_s are shortened to it, steps back count as none."""
+    """Log time (n,) of each frame since the first, ns: gaps are limited to max_gap_s, steps back count as zero."""
     steps_ns = np.clip(np.diff(stamps_us, prepend=stamps_us[:1]), 0, _LATEST_US) * 1000
     if max_gap_s is not None:
         steps_ns = np.minimum(steps_ns, round(max_gap_s * 1e9))
@@ -43,14 +43,14 @@ def log_times_ns(stamps_us: Times, max_gap_s: float | None = None) -> Times:
 class Player:
     """Plays frames 0 .. n - 1 by their log times (n,), ns.
 
-    prepare    gives a frame in a pass (both from 0) as what `send` takes, ahead of its moment; send takes it at it
-    look       called first, and then some fifty times a second, between frames and also while it is held: may call `hold`,
+    prepare    gives what is to be sent of a frame in a pass (both counted from 0) ahead of time; send sends it when due
+    look       called first, and then about 50 times per second, between frames and also while paused: may call `hold`,
                `step`, `seek`, `stop`
-    speed      of log time against time; None: as fast as it goes
+    speed      log time over clock time; None: as fast as possible
 
-    at         the frame that is due next             sent        how many have gone
-    passes     whole passes done                      lateness_ns of each frame sent by schedule
-    moved      whether it was held, stepped or sought: its speed then says nothing
+    at         number of the next frame               sent        frames sent
+    passes     complete passes                        lateness_ns of each frame sent by schedule
+    moved      whether it was paused, stepped or sought: its measured speed then has no meaning
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Player:
         self._anchor()
 
     def play(self, *, loop: bool = False) -> None:
-        """Play to the end, or for ever; returns early where `stop` was called. Raises what prepare, send and look do."""
+        """Play to the end, or forever; returns early after `stop`. Raises what prepare, send and look raise."""
         self._look_now()
         self._anchor()
         while True:
@@ -93,12 +93,12 @@ class Player:
                 return
             end_ns = self._due_ns(len(self._times) - 1)
             self.at = 0
-            # The next pass begins when the last frame was due, not when it went: a loop keeps its schedule too.
+            # The next pass begins when the last frame was due, not when it was sent: a loop keeps its schedule too.
             self._anchor(end_ns if self.speed and not self.held else None)
 
     def _play_pass(self) -> None:
         count = len(self._times)
-        first, frames = 0, list[Any]()  # frames of one moment, made ready ahead of it
+        first, frames = 0, list[Any]()  # frames due at the same time, prepared ahead
         while self.at < count and not self._stopped:
             now_ns = self._clock.now_ns()
             if self._look and now_ns >= self._next_look_ns + self._putting_off_ns():
@@ -129,29 +129,29 @@ class Player:
             self._look(self)
 
     def _putting_off_ns(self) -> int:
-        """How long a look that is due is put off now: until there is room for it, if not for ever."""
+        """How long a due poll may be postponed now (ns)."""
         return LATEST_LOOK_NS if self.room_ns < LOOK_ROOM_NS else 0
 
     @property
     def room_ns(self) -> int:
-        """How long it is until the next frame is due; without a schedule, a long time."""
+        """Time until the next frame is due (ns); without a schedule, LOOK_PERIOD_NS."""
         if not self.speed or self.held or self.at >= len(self._times):
             return LOOK_PERIOD_NS
         return self._due_ns(self.at) - self._clock.now_ns()
 
     def hold(self) -> None:
-        """Pause, or go on from where it stands."""
+        """Pause, or continue from the present position."""
         self.held, self.moved = not self.held, True
         self._steps = 0
         self._anchor()
 
     def step(self) -> None:
-        """Send one frame and stay held."""
+        """Send one frame and stay paused."""
         self.held = self.moved = True
         self._steps += 1
 
     def seek(self, by_s: float) -> None:
-        """Move by so much log time, within the log; what lies between is not sent."""
+        """Move by `by_s` of log time, within the log; frames in between are not sent."""
         self.moved = True
         here_ns = self._times[min(self.at, len(self._times) - 1)]
         self.at = int(np.searchsorted(self.times_ns, here_ns + round(by_s * 1e9)))
@@ -168,7 +168,7 @@ class Player:
         return self._times[min(self.at, len(self._times) - 1)] if self._times else 0
 
     def _end_of_moment(self, first: int) -> int:
-        """The number after the last frame that is due with this one, but not very far from it."""
+        """The number after the last frame with the same time as this one, at most LARGEST_MOMENT further."""
         end, most = first + 1, min(len(self._times), first + LARGEST_MOMENT)
         while end < most and self._times[end] == self._times[first]:
             end += 1

@@ -1,12 +1,12 @@
-"""A ring of bytes in shared memory: one process puts, another takes, neither waits for the other.
+"""A ring buffer in shared memory: one process writes, another reads, neither waits for the other.
 
-The loop must not wait for a disk, and a thread of its own would fight it for the interpreter; so what is to be recorded goes
-through such a ring to a process of its own (`log_writer`). Only the standard library is imported here: that process starts
-in a moment.
+The loop must not wait for a disk, and a writer thread would compete with it for the interpreter; so recorded data goes
+through this ring to a separate process (`log_writer`). Only the standard library is imported here, so that this process
+starts quickly.
 
-Layout: 64 bytes of header (how many bytes were ever put, how many were taken, the error number of the taker's last write),
-then the bytes. Machines differ in whether another core sees two stores in their order, so the taker only takes what it saw
-announced one look ago, some milliseconds earlier, or after the putter's end.
+Layout: 64 bytes of header (total bytes put, total bytes taken, error number of the reader's last file write), then the data.
+On some machines another core may see two stores in a different order, so the reader only takes bytes whose count it saw at
+its previous poll, some milliseconds earlier, or after the writer has ended.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _PUT, _TAKEN, _ERROR = range(3)
 
 
 class ByteRing:
-    """One end of a ring over the memory behind a file descriptor, which both processes hold open."""
+    """One end of a ring in the memory of a file descriptor that both processes hold open."""
 
     def __init__(self, descriptor: int, capacity: int) -> None:
         self.descriptor = descriptor
@@ -33,7 +33,7 @@ class ByteRing:
 
     @classmethod
     def create(cls, capacity: int) -> ByteRing:
-        """A new ring; it goes when the last process that holds it ends."""
+        """A new ring; its memory is freed when the last process that holds it ends."""
         if hasattr(os, "memfd_create"):
             descriptor = os.memfd_create("fwav-hil-ring")
         else:
@@ -43,7 +43,7 @@ class ByteRing:
         return cls(descriptor, capacity)
 
     def put(self, data: bytes | bytearray) -> bool:
-        """Put all of `data`, or nothing where it does not fit (False)."""
+        """Write all of `data`, or nothing where it does not fit (False)."""
         words = self._words
         put, size = words[_PUT], len(data)
         if put + size - words[_TAKEN] > self.capacity:
@@ -60,23 +60,23 @@ class ByteRing:
 
     @property
     def put_bytes(self) -> int:
-        """How many bytes were ever put."""
+        """Total number of bytes put."""
         return int(self._words[_PUT])
 
     @property
     def taken_bytes(self) -> int:
-        """How many bytes were ever taken."""
+        """Total number of bytes taken."""
         return int(self._words[_TAKEN])
 
     @property
     def error(self) -> int:
-        """The error number of the taker's last write; 0 where it went well."""
+        """The error number of the reader's last file write; 0 where it succeeded."""
         return int(self._words[_ERROR])
 
     def write_to(self, file: int, until: int) -> None:
-        """Take what was put before the byte numbered `until`, and write it to a file descriptor.
+        """Take the bytes before number `until` and write them to a file descriptor.
 
-        An OSError of the file is noted (`error`); what it did not take stays for the next time.
+        An OSError of the file is stored in `error`; bytes that were not written stay in the ring.
         """
         taken = self.taken_bytes
         try:
@@ -90,11 +90,11 @@ class ByteRing:
             self._words[_ERROR] = error.errno or -1
 
     def take_over_at(self, taken: int) -> None:
-        """Go on taking at that byte, where the process that took has died."""
+        """Continue at that byte after the reading process has died."""
         self._words[_TAKEN] = taken
 
     def close(self) -> None:
-        """Let go of the memory; calling it again does nothing."""
+        """Release the memory; calling it again does nothing."""
         if not self._map.closed:
             self._words.release()
             self._bytes.release()

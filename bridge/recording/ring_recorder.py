@@ -1,8 +1,8 @@
-"""The recorder of the loop: it hands frames to a process of its own through a ring, and never waits for a disk.
+"""The recorder of the loop: it passes frames to a separate process through a ring buffer, and never waits for a disk.
 
-What `recorder.Recorder` does with a thread, for one link, without that thread's claim on the interpreter. A kill -9 of the
-loop's process loses nothing that was handed over: the writer sees its input end and writes the rest. Where the writer dies,
-another one goes on at the byte where it left off.
+It does for one link what `thread_recorder.Recorder` does with a thread, without that thread's use of the interpreter. A
+kill -9 of the loop's process loses nothing that was handed over: the writer process sees its stdin end and writes the
+rest. If the writer dies, a new one continues at the byte where it stopped.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from bridge.timing.clock import Clock, MonotonicClock
 from protocol.logs.scan import scan_tlog
 
 CAPACITY_BYTES: Final = 16 << 20
-"""Over a minute of a 1 kHz loop: so long a disk may stall before a frame is lost."""
+"""Over a minute of a 1 kHz loop: the disk may stall this long before a frame is lost."""
 _PATIENCE_S: Final = 30.0
 _LOOK_NS: Final = 1_000_000
 
@@ -29,11 +29,11 @@ _LOOK_NS: Final = 1_000_000
 class RingRecorder(SidecarLog):
     """A log of one link, written by another process, with its sidecar.
 
-    Where the disk refuses, `tell` hears one sentence about it at the next `flush`, and the writer tries again as long as the
-    ring has room; without `tell` the sentence is raised as RunFolderError, once.
+    After a write error `tell` is called with one message at the next `flush`, and the writer retries as long as the ring
+    has space; without `tell` the message is raised as RunFolderError, once.
 
     restarts    writers that died and were replaced
-    may_wait    whether `hand_over` waits for room (lockstep) or counts frames as lost (real time)
+    may_wait    whether `hand_over` waits for space (lockstep) or counts frames as lost (real time)
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class RingRecorder(SidecarLog):
         capacity: int = CAPACITY_BYTES,
         clock: Clock | None = None,
     ) -> None:
-        """Begin the log with its sidecar; see `new_sidecar`. Raises RunFolderError where that is not possible."""
+        """Begin the log with its sidecar; see `new_sidecar`. Raises RunFolderError where that fails."""
         super().__init__(path, (link,), stamps=stamps, source=source, tell=tell)
         self.restarts = self.deepest_bytes = 0
         self._may_wait = may_wait
@@ -72,16 +72,16 @@ class RingRecorder(SidecarLog):
 
     @property
     def writer_pid(self) -> int:
-        """The process that writes."""
+        """Process id of the writer."""
         return self._writer.pid
 
     def write(self, t_us: int, frame: bytes) -> None:
-        """Add one frame to what `hand_over` gives to the writer."""
+        """Add one frame; `hand_over` passes it to the writer."""
         self._append(t_us, frame)
         self._pending_frames += 1
 
     def hand_over(self) -> None:
-        """Give the writer what was added."""
+        """Pass the added frames to the writer."""
         if not self._pending:
             return
         if not self.ring.put(self._pending) and not (self._may_wait and self._put_patiently()):
@@ -92,7 +92,7 @@ class RingRecorder(SidecarLog):
         self._pending_frames = 0
 
     def _put_patiently(self) -> bool:
-        """Wait for room, as long as the writer makes any."""
+        """Wait for space, as long as the writer reports no error; whether the frames fitted."""
         give_up_ns = self._clock.now_ns() + round(_PATIENCE_S * 1e9)
         while not self.ring.put(self._pending):
             if self.ring.error or self._clock.now_ns() > give_up_ns:
@@ -102,7 +102,7 @@ class RingRecorder(SidecarLog):
         return True
 
     def flush(self) -> None:
-        """Hand over, and see to the writer: nothing that takes long, unless the writer has died."""
+        """Hand over, and check the writer: quick, unless the writer has died."""
         self.hand_over()
         self.deepest_bytes = max(self.deepest_bytes, self.ring.put_bytes - self.ring.taken_bytes)
         self._see_to_the_writer()
@@ -117,9 +117,9 @@ class RingRecorder(SidecarLog):
             self._writer = self._start()
 
     def close(self) -> None:
-        """Have the rest written, and the sidecar say how the log ended; may be called again.
+        """Write the rest, and the end of the log to the sidecar; may be called again.
 
-        What cannot be written is cut off after the last whole record. Raises RunFolderError where that has not been told.
+        After a write error the log ends with its last complete record; raises RunFolderError unless that was reported before.
         """
         if self._file.closed:
             return
@@ -131,7 +131,7 @@ class RingRecorder(SidecarLog):
             self._writer.kill()
             self._writer.wait()
         size = os.fstat(self._file.fileno()).st_size
-        if size < self.ring.put_bytes:  # the writer died, or the disk refused it: one more try
+        if size < self.ring.put_bytes:  # the writer died, or had a write error: one more attempt
             self.ring.take_over_at(size)
             self.ring.write_to(self._file.fileno(), self.ring.put_bytes)
         problem = f"cannot write the log {self.path}: {os.strerror(self.ring.error)}" if self.ring.error else ""
@@ -148,12 +148,12 @@ class RingRecorder(SidecarLog):
         )
 
     def _end_input(self) -> None:
-        """Close the writer's standard input: it then writes the rest and ends, if it still runs."""
+        """Close the writer's standard input: if it still runs, it then writes the rest and exits."""
         if self._writer.stdin:
             self._writer.stdin.close()
 
     def _cut_off(self) -> None:
-        """End the log with its last whole record, and count what is missing."""
+        """Truncate the log after its last complete record, and count the missing frames."""
         frames = scan_tlog(self.path).frames
         whole = int(frames[-1]["offset"]) + int(frames[-1]["length"]) if len(frames) else 0
         with contextlib.suppress(OSError):

@@ -1,15 +1,15 @@
-"""The sidecar of a log, `run.tlog.json` beside `run.tlog`: which run it is, by which link each frame came, whether it is whole.
+"""The sidecar of a log, `run.tlog.json` beside `run.tlog`: its run, the link of each frame, and whether it is complete.
 
-    complete   false from the first moment on, true once the log was closed with every frame in it
-    stamps     "simulation time" or "Unix time"; either in microseconds
+    complete   false from the beginning, true once the log was closed with every frame in it
+    stamps     "simulation time" or "Unix time"; both in microseconds
     links      by number: uri, peer, and sent_by, the [system, component] whose frames were sent there; all other frames of
-               the link were received. A recorder that only listens has sent nothing.
-    index      where there are several links, the file that says which frame is of which link; else null
+               the link were received. A recorder that only receives has no sent_by.
+    index      with several links, the file that gives the link of each frame; else null
 
-The stamps themselves stay what they are: MAVProxy writes a link number over their two low bits (3 is its own output), and
-pymavlink reads those bits of any log as the link, so with our stamps its `_link` has no meaning. Hence the index: 8 bytes
-(big endian) for each change of link, place in the log << 8 | link. It names the place before the log has it, so that a
-process killed in between leaves no frame without its link.
+The stamps are left unchanged: MAVProxy writes a link number over their two low bits (3 is its own output), and pymavlink
+reads those bits of any log as the link, so with our stamps its `_link` has no meaning. The index therefore has 8 bytes
+(big endian) for each change of link: offset in the log << 8 | link. An entry is written before the frames that it applies
+to, so that a process killed in between leaves no frame without its link.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ INDEX_ENTRY = struct.Struct(">Q")
 
 
 class LinkOfLog(NamedTuple):
-    """One link of a log: its URI, its peer as far as known, and who of the senders sat on this end of it."""
+    """One link of a log: its URI, its peer if known, and the (system, component) of the senders on this end."""
 
     uri: str
     peer: str = ""
@@ -38,17 +38,17 @@ class LinkOfLog(NamedTuple):
 
 
 def sidecar_path(log: Path) -> Path:
-    """Where the sidecar of a log is."""
+    """Path of the sidecar of a log."""
     return log.with_name(log.name + ".json")
 
 
 def index_path(log: Path) -> Path:
-    """Where the index of the links is, for a log that has several."""
+    """Path of the link index, for a log with several links."""
     return log.with_name(log.name + ".links")
 
 
 def new_sidecar(log: Path, links: tuple[LinkOfLog, ...], *, stamps: str, source: dict[str, Any]) -> dict[str, Any]:
-    """The sidecar of a log that begins now; source says what it is of: scenario, seed, clock mode ..."""
+    """The sidecar of a log that begins now; source describes the run: scenario, seed, clock mode ..."""
     return {
         "format": FORMAT,
         "complete": False,
@@ -68,20 +68,20 @@ def new_sidecar(log: Path, links: tuple[LinkOfLog, ...], *, stamps: str, source:
 
 
 def write_sidecar(log: Path, content: dict[str, Any]) -> None:
-    """Write the sidecar in one piece. Raises RunFolderError."""
+    """Write the sidecar atomically. Raises RunFolderError."""
     write_json(sidecar_path(log), content)
 
 
 def read_sidecar(log: Path) -> dict[str, Any]:
-    """The sidecar of a log; empty where there is none, or another program's file of that name. Raises RunFolderError."""
+    """The sidecar of a log; empty where it is missing, or is another program's file. Raises RunFolderError."""
     content = read_json(sidecar_path(log))
     return content if content.get("format") == FORMAT else {}
 
 
 def link_numbers(log: Path, offsets: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
-    """The link (n,) of the records that begin at these places (n,) of the log. Raises RunFolderError.
+    """The link (n,) of the records that begin at these offsets (n,) of the log. Raises RunFolderError.
 
-    All zeros where the log has but one link.
+    All zeros where the log has only one link.
     """
     if not read_sidecar(log).get("index"):
         return np.zeros(len(offsets), dtype=np.uint8)
@@ -97,6 +97,6 @@ def link_numbers(log: Path, offsets: npt.NDArray[np.int64]) -> npt.NDArray[np.ui
 
 
 def was_sent(sidecar: dict[str, Any], link: int, system: int, component: int) -> bool:
-    """Whether a frame of that sender on that link was sent by the recorded program, and not received by it."""
+    """Whether the recorded program sent (and did not receive) the frames of that sender on that link."""
     links = sidecar.get("links", [])
     return link < len(links) and [system, component] in links[link]["sent_by"]

@@ -1,8 +1,8 @@
-"""Recording: frames into a log while the loop goes on, safe against a kill, honest about a disk that refuses.
+"""Recording of frames into a log while the loop runs, robust against a kill and write errors.
 
-The loop only appends to a queue. A thread writes what is there every 40 ms, in whole writes to the system, which keeps it
-whatever becomes of the process: a kill -9 loses the last moments, less than 100 ms, and at most cuts the last record, which
-readers skip. Until `close` the sidecar says that the log is not complete.
+The loop only appends to a queue. A thread writes it to the system every 40 ms, where it is safe if the process dies: a
+kill -9 loses less than the last 100 ms, and at most truncates the last record, which readers skip. Until `close` the
+sidecar marks the log as incomplete.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from protocol.errors import RunFolderError
 
 FLUSH_PERIOD_S: Final = 0.04
 QUEUE_LIMIT: Final = 500_000
-"""Frames that may wait for the thread, while a disk holds it up; further ones are lost, and counted."""
+"""Frames that may wait for the thread while the disk blocks it; further ones are lost, and counted."""
 PENDING_LIMIT_BYTES: Final = 64 << 20
-"""What may wait for a disk that refuses; further frames are lost, and counted."""
+"""Bytes that may wait during write errors; further frames are lost, and counted."""
 
 _STAMP = struct.Struct(">Q")
 
 
 class Recorder(SidecarLog):
-    """A log that is written behind the back of the loop, with its sidecar.
+    """A log that is written by a background thread, with its sidecar.
 
-    Where the disk refuses, `tell` hears one sentence about it, at the next `write`; the recorder goes on, tries again every
-    40 ms, and counts as lost what it cannot keep in the end. Without `tell` the sentence is raised as RunFolderError, once.
+    After a write error `tell` is called with one message at the next `write`; the recorder continues, retries every
+    40 ms, and counts frames that it cannot write in the end as lost. Without `tell` RunFolderError is raised, once.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Recorder(SidecarLog):
         source: dict[str, Any],
         tell: Tell | None = None,
     ) -> None:
-        """Begin the log with its sidecar; see `new_sidecar`. Raises RunFolderError where that is not possible."""
+        """Begin the log with its sidecar; see `new_sidecar`. Raises RunFolderError where that fails."""
         super().__init__(path, links, stamps=stamps, source=source, tell=tell)
         self._news = ""
         self._queue: deque[tuple[int, bytes]] = deque()
@@ -72,14 +72,14 @@ class Recorder(SidecarLog):
                 self.lost += 1
 
     def flush(self) -> None:
-        """Nothing a loop would have to wait for: only what the disk refused meanwhile is told."""
+        """Report a write error that occurred meanwhile; never waits."""
         if self._news:
             self._say_news()
 
     def close(self) -> None:
-        """Write the rest, and have the sidecar say how the log ended; may be called again.
+        """Write the rest, and the end of the log to the sidecar; may be called again.
 
-        What cannot be written is cut off after the last whole record. Raises RunFolderError where that has not been told.
+        After a write error the log ends with its last complete record; raises RunFolderError unless that was reported before.
         """
         if self._file.closed:
             return
@@ -100,7 +100,7 @@ class Recorder(SidecarLog):
             self._drain()
 
     def _drain(self) -> None:
-        """Hand what is in the queue to the system; called by one thread at a time."""
+        """Write the queue to the system; called by one thread at a time."""
         for _ in range(len(self._queue)):
             link, record = self._queue.popleft()
             if len(self._pending) > PENDING_LIMIT_BYTES:
@@ -124,7 +124,7 @@ class Recorder(SidecarLog):
             self._whole_bytes = self._ends.popleft()
 
     def _write_index(self) -> None:
-        """The index goes first, so that no frame is in the log without its link."""
+        """Write the index; before the frames, so that no frame is in the log without its link."""
         if not self._index:
             self._index_pending.clear()
             return
@@ -135,13 +135,13 @@ class Recorder(SidecarLog):
             raise RunFolderError(f"cannot write the links of the log {self.path}: {error.strerror}") from None
 
     def _say_news(self) -> None:
-        """Tell what the disk refused meanwhile."""
+        """Report the write error that occurred meanwhile."""
         sentence, self._news = self._news, ""
         self._say(sentence)
 
 
 def refuse_existing_log(path: Path) -> None:
-    """Raise RunFolderError where a log, its sidecar or its index is there already: nothing recorded is overwritten."""
+    """Raise RunFolderError where a log, its sidecar or its index exists already: recorded data is never overwritten."""
     for taken in (path, sidecar_path(path), index_path(path)):
         if taken.exists():
-            raise RunFolderError(f"{taken} is there already, which stays: choose another file with --out, or remove it")
+            raise RunFolderError(f"{taken} exists and is not overwritten: choose another file with --out, or remove it")

@@ -1,6 +1,6 @@
-"""Clocks: the only place of the project that asks the system for the time.
+"""Clocks: the only place in the project that reads the system time.
 
-Everything that waits or measures is given a `Clock`; lockstep, real time, replay and tests differ in which one.
+Everything that waits or measures takes a `Clock`; lockstep, real time, replay and tests use different ones.
 """
 
 from __future__ import annotations
@@ -10,17 +10,17 @@ import time
 
 LEAST_EARLY_NS = 100_000
 MOST_EARLY_NS = 20_000_000
-"""Bounds of how long before its moment a `PunctualClock` wakes."""
+"""Bounds of how long before the requested time a `PunctualClock` wakes."""
 _CLOSE_NS = 2_000
-"""Readings of the two clocks that are no further apart than this are good enough."""
+"""Readings of the two clocks within this time are close enough together."""
 
 
 class Clock(abc.ABC):
-    """Tells the time and waits for it."""
+    """Gives the time and waits until a time."""
 
     @abc.abstractmethod
     def now_ns(self) -> int:
-        """Now, in ns since an arbitrary moment; never runs backwards."""
+        """Now, in ns since an arbitrary origin; never decreases."""
 
     @abc.abstractmethod
     def sleep_until_ns(self, t_ns: int) -> None:
@@ -28,7 +28,7 @@ class Clock(abc.ABC):
 
     @abc.abstractmethod
     def spin_until_ns(self, t_ns: int) -> None:
-        """The same without letting go of the core: exact, and as dear as work."""
+        """The same by polling, without releasing the core: exact, but it takes processor time."""
 
 
 class MonotonicClock(Clock):
@@ -45,20 +45,20 @@ class MonotonicClock(Clock):
             time.sleep(remaining_ns * 1e-9)
 
     def spin_until_ns(self, t_ns: int) -> None:
-        """Ask for the time again and again."""
+        """Poll the time."""
         now_ns = time.monotonic_ns
         while now_ns() < t_ns:
             pass
 
 
 class PunctualClock(MonotonicClock):
-    """The machine's clock for those who must be on time: it wakes early and polls for the rest.
+    """The machine's clock with exact waits: it wakes early and polls for the rest.
 
-    How early follows from how late the machine's sleeps have lately been: some 100 us on a quiet machine, up to 20 ms on a
-    shared virtual one, where frames that come that densely then keep a core busy.
+    How early depends on how late recent sleeps ended: some 100 us on a quiet machine, up to 20 ms on a shared virtual one,
+    where deadlines closer together than that keep a core busy.
 
-    sleeps_half   sleep through half of each wait at least. For a real-time thread: the kernel stops one that never lets go
-                  of its core, for 50 ms of each second (sched(7), sched_rt_runtime_us).
+    sleeps_half   sleep for at least half of each wait. For a real-time thread: the kernel stops one that never releases
+                  its core, for 50 ms of each second (sched(7), sched_rt_runtime_us).
     """
 
     def __init__(self, *, sleeps_half: bool = False) -> None:
@@ -66,7 +66,7 @@ class PunctualClock(MonotonicClock):
         self._sleeps_half = sleeps_half
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Sleep, then poll; returns within some microseconds of t_ns where the machine runs this process at all."""
+        """Sleep, then poll; returns within some microseconds of t_ns, unless the machine suspends this process."""
         now_ns = time.monotonic_ns()
         wake_ns = t_ns - self._early_ns
         if self._sleeps_half and t_ns - now_ns > LEAST_EARLY_NS:
@@ -81,13 +81,13 @@ class PunctualClock(MonotonicClock):
 
 
 class VirtualClock(Clock):
-    """A clock that stands still until it is told to go on; sleeping moves it."""
+    """A clock that stands still until it is advanced; sleeping advances it."""
 
     def __init__(self, t_ns: int = 0) -> None:
         self._t_ns = t_ns
 
     def now_ns(self) -> int:
-        """The time it was set to, ns."""
+        """The present time of this clock, ns."""
         return self._t_ns
 
     def sleep_until_ns(self, t_ns: int) -> None:
@@ -99,12 +99,12 @@ class VirtualClock(Clock):
         self.sleep_until_ns(t_ns)
 
     def advance_ns(self, step_ns: int) -> None:
-        """Move on by step_ns."""
+        """Advance by step_ns."""
         self._t_ns += step_ns
 
 
 def processor_time_ns() -> int:
-    """What this process has used of all cores so far, ns."""
+    """Processor time that this process has used so far on all cores, ns."""
     return time.process_time_ns()
 
 
@@ -114,9 +114,9 @@ def unix_time_us() -> int:
 
 
 def unix_offset_ns() -> int:
-    """CLOCK_REALTIME less CLOCK_MONOTONIC now, ns: the kernel stamps what it receives with the former.
+    """CLOCK_REALTIME minus CLOCK_MONOTONIC now, ns: the kernel stamps received datagrams with the former.
 
-    Being put to sleep between two readings of the clocks would falsify the offset by as much: the closest of three counts.
+    A preemption between the readings of the two clocks falsifies the offset: the closest of three pairs is used.
     """
     readings = []
     for _ in range(3):

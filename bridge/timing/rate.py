@@ -1,4 +1,4 @@
-"""Rate keeping: an absolute schedule that does not drift, and an account of how late each tick was."""
+"""Rate keeping: an absolute schedule that does not drift, with statistics of how late each tick was."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from bridge.summary import percentiles_us
 from bridge.timing.clock import Clock
 
 LATE_BY_US = (5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000)
-"""Upper bounds of the classes that lateness is counted in."""
+"""Upper bounds of the lateness classes."""
 
 LARGEST_SHARE = 10
-"""A tick is late, and a spin long enough, at the LARGEST_SHARE-th part of a period."""
+"""A tick counts as late beyond 1 / LARGEST_SHARE of a period, which is also the longest measured spin."""
 
 _TRIAL_SLEEPS = 60
 _TRIAL_PERIOD_NS = 1_000_000
 
 
 class RateKeeper:
-    """Deadlines at start + k periods. A tick that is late is counted; a late schedule is never caught up in a burst.
+    """Deadlines at start + k periods. Late ticks are counted; missed periods are never caught up in a burst.
 
-    Where a tick is a whole period late or more, the schedule moves on by the whole periods missed (`slipped` counts
-    them), so that the next tick comes a period later and not at once.
+    Where a tick is a whole period late or more, the schedule moves on by the missed whole periods (counted as `slipped`),
+    so that the next tick does not follow at once.
 
-    spin_ns      length of the wait's end that is polled instead of slept (see `measure_spin_ns`)
+    spin_ns      last part of each wait, which is polled instead of slept (see `measure_spin_ns`)
     lateness_ns  how late each tick was
     counters     late     ticks that began after their deadline by more than a tenth of a period
                  slipped  periods by which the schedule was moved
@@ -46,7 +46,7 @@ class RateKeeper:
         self.deadline_ns = self._clock.now_ns() + self.period_ns
 
     def resume(self) -> None:
-        """Go on with a schedule that nobody kept for a while: its next deadline is the first that has not passed."""
+        """Continue the schedule after a pause: the next deadline is the first that has not passed."""
         behind_ns = self._clock.now_ns() - self.deadline_ns
         if behind_ns > 0:
             self.deadline_ns += -(-behind_ns // self.period_ns) * self.period_ns
@@ -58,14 +58,14 @@ class RateKeeper:
             self._clock.spin_until_ns(self.deadline_ns)
 
     def remaining_s(self) -> float | None:
-        """How long (s) one may sleep, 0 where the spin has begun; None where the deadline has come."""
+        """How long (s) the caller may sleep; 0 once the spin has begun; None at or after the deadline."""
         remaining_ns = self.deadline_ns - self._clock.now_ns()
         if remaining_ns <= 0:
             return None
         return max(0, remaining_ns - self.spin_ns) * 1e-9
 
     def tick(self) -> int:
-        """Account for the deadline just reached and set the next one; returns the lateness in ns."""
+        """Record the lateness at the deadline just reached and set the next one; returns the lateness in ns."""
         lateness_ns = max(0, self._clock.now_ns() - self.deadline_ns)
         self.lateness_ns.append(lateness_ns)
         self.latest_ns = max(self.latest_ns, lateness_ns)
@@ -77,7 +77,7 @@ class RateKeeper:
         return lateness_ns
 
     def summary(self) -> dict[str, Any]:
-        """How late the ticks were, for a summary: percentiles (us), counts by class, and the spin (us)."""
+        """Lateness of the ticks, for a summary: percentiles (us), counts by class, and the spin (us)."""
         return {
             **percentiles_us(self.lateness_ns),
             "late_by": count_by_lateness(self.lateness_ns),
@@ -95,10 +95,10 @@ def count_by_lateness(lateness_ns: Sequence[int]) -> dict[str, int]:
 
 
 def measure_spin_ns(clock: Clock, period_ns: int) -> int:
-    """How much sooner than a deadline to wake, so that nearly every wake-up is in time: takes 0.06 s.
+    """How long before a deadline to wake so that nearly every wake-up is in time; the measurement takes 0.06 s.
 
-    The 95th percentile of how late some sleeps end, and a quarter more; at most a tenth of the period, so that a poor
-    machine costs jitter and not a core.
+    1.25 times the 95th percentile of the lateness of some sleeps; at most a tenth of the period, so that a slow machine
+    causes jitter instead of a busy core.
     """
     lateness_ns = []
     for _ in range(_TRIAL_SLEEPS):
@@ -110,7 +110,7 @@ def measure_spin_ns(clock: Clock, period_ns: int) -> int:
 
 
 def choose_spin_ns(clock: Clock, period_ns: int, wanted_s: float | None, *, measure: bool) -> int:
-    """The spin of a loop: what the user wants, up to half the period; else as measured, or 0."""
+    """The spin of a loop: the user's value, up to half the period; else as measured, or 0."""
     if wanted_s is not None:
         return min(round(wanted_s * 1e9), period_ns // 2)
     return measure_spin_ns(clock, period_ns) if measure else 0

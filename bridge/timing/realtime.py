@@ -1,14 +1,14 @@
-"""What a process asks of the system to keep time well, and what the system says to it.
+"""Real-time settings that a process requests from the system, and the result of each.
 
-    scheduler    SCHED_FIFO: no ordinary process comes before this one         needs rtprio or CAP_SYS_NICE
-    memory       mlockall: no page of it is ever fetched from disk             needs memlock or CAP_IPC_LOCK
-    core         a core of its own, where there are two
-    idle states  /dev/cpu_dma_latency held open at 0: no core sleeps deeply    needs write access to that file
-    timer slack  1 ns: a sleep is not stretched to share a wake-up (prctl)
+    scheduler    SCHED_FIFO: no ordinary process preempts this one             needs rtprio or CAP_SYS_NICE
+    memory       mlockall: none of its pages is ever read from disk            needs memlock or CAP_IPC_LOCK
+    core         core affinity: a core of its own, where there are two
+    idle states  /dev/cpu_dma_latency held open at 0: no deep idle states      needs write access to that file
+    timer slack  1 ns: a sleep is not extended to share a wake-up (prctl)
     collector    garbage collection frozen and off
 
-Each is asked for by itself; what is refused costs regularity, never the run. Sources: sched(7), mlockall(2), prctl(2), and
-the kernel's Documentation/power/pm_qos_interface.
+Each is requested separately; a refusal causes more jitter, but never ends the run. Sources: sched(7), mlockall(2),
+prctl(2), and the kernel's Documentation/power/pm_qos_interface.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from bridge.reporting import Report
 from protocol.errors import UsageError
 
 PRIORITY = 80
-"""Of SCHED_FIFO, 1 to 99: above the kernel's threaded interrupts (50), below its own watchdogs (99)."""
+"""SCHED_FIFO priority, 1 to 99: above the kernel's threaded interrupts (50), below its watchdogs (99)."""
 
 OWN_CORE = "a core of its own"
 DMA_LATENCY = Path("/dev/cpu_dma_latency")
 SHELL_REMEDY = "sudo prlimit --pid $$ --rtprio=99 --memlock=unlimited"
-"""Lets what is started from this shell afterwards have both; docs/realtime.md says how to make it last."""
+"""Sets both limits for programs started from this shell; docs/realtime.md explains the permanent setting."""
 
 _LOCK_CURRENT, _LOCK_FUTURE = 1, 2
 _SET_TIMER_SLACK, _GET_TIMER_SLACK = 29, 30
 
 
 class Setting(msgspec.Struct, frozen=True):
-    """One thing asked of the system: whether it was granted, what that means or why not, and what would mend it."""
+    """One requested setting: whether it was granted, what that means or why not, and the remedy."""
 
     name: str
     granted: bool
@@ -52,30 +52,30 @@ Settings = tuple[Setting, ...]
 
 
 def own_core(place: int) -> int | None:
-    """The core for the place-th process of a pair: the last ones there are, since the first one serves most interrupts.
+    """The core for process number `place` of a pair, counted from the last core, since the first serves most interrupts.
 
-    None where this process may use one core only, or the system does not tell.
+    None where this process may use only one core, or the system does not provide the affinity.
     """
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     return cores[-1 - place] if place < len(cores) and len(cores) > 1 else None
 
 
 def check_real_time(clock: str, *, realtime: bool, trigger: str = "sample") -> None:
-    """Raise UsageError where real-time settings, or a clock of the controller's own, are asked for in lockstep."""
+    """Raise UsageError where real-time settings, or the controller's own clock, are requested in lockstep."""
     if clock != "realtime" and trigger == "clock":
-        raise UsageError("--trigger clock steps on wall time, for which lockstep does not wait: add --clock realtime")
+        raise UsageError("--trigger clock steps on wall time, which lockstep does not follow: add --clock realtime")
     if clock != "realtime" and realtime:
-        raise UsageError("--realtime is about keeping wall time, which lockstep does not: add --clock realtime")
+        raise UsageError("--realtime helps to keep wall time, which lockstep does not follow: add --clock realtime")
 
 
 @contextlib.contextmanager
 def real_time(core: int | None) -> Iterator[Settings]:
-    """Ask for everything above while the block runs, `core` being the core to have; yields what came of each.
+    """Request all settings above, with affinity to `core`, while the block runs; yields the result of each.
 
-    All is given back at the end. Affects the calling thread (scheduler, core, slack) and the process (the rest).
+    All are restored at the end. Affects the calling thread (scheduler, core, slack) and the process (the rest).
     """
     with contextlib.ExitStack() as undo:
-        # The lock first: it brings the whole process into memory, which is not a thing to do above all others.
+        # Lock memory first: it loads the whole process into memory, which should not run at real-time priority.
         yield (
             _lock_memory(undo),
             _hold_idle_states(undo),
@@ -87,19 +87,19 @@ def real_time(core: int | None) -> Iterator[Settings]:
 
 
 def has_own_core(settings: Settings) -> bool:
-    """Whether the process has a core of its own, where polling takes time from nobody."""
+    """Whether the process has a core of its own, where polling takes no time from other processes."""
     return any(setting.granted for setting in settings if setting.name == OWN_CORE)
 
 
 def report_settings(report: Report, settings: Settings) -> None:
-    """Say what came of each, where anything was asked for."""
+    """Report the result of each setting, if any was requested."""
     if settings:
         report({"event": "realtime", "settings": settings})
 
 
 @contextlib.contextmanager
 def maybe_real_time(core: int | None, *, wanted: bool) -> Iterator[Settings]:
-    """`real_time` where it is wanted; else nothing is asked for and nothing yielded."""
+    """`real_time` where `wanted`; else no setting is requested, and an empty tuple is yielded."""
     if not wanted:
         yield ()
         return
@@ -113,7 +113,7 @@ def _take_priority(undo: contextlib.ExitStack) -> Setting:
         return Setting(name, False, f"{sys.platform} has no such call")
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
-        # What is forked from here (a recorder, say) begins as an ordinary process.
+        # Child processes (such as a recorder) start as ordinary processes.
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
     except OSError as error:
         limit, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
@@ -123,7 +123,7 @@ def _take_priority(undo: contextlib.ExitStack) -> Setting:
 
 
 def _give_back_priority(policy: int, parameters: os.sched_param) -> None:
-    """Be scheduled as before. Without CAP_SYS_NICE the flag that resets on fork cannot be taken back, and stays."""
+    """Restore the scheduler. Without CAP_SYS_NICE the reset-on-fork flag cannot be cleared, and stays."""
     try:
         os.sched_setscheduler(0, policy, parameters)
     except PermissionError:
@@ -138,15 +138,15 @@ def _lock_memory(undo: contextlib.ExitStack) -> Setting:
     except (OSError, AttributeError):
         return Setting(name, False, f"{sys.platform} has no such call")
     limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    # Below a limit the lock could succeed now and a later allocation fail in the middle of a run: then lock less.
+    # With a limit the lock could succeed now and a later allocation fail during the run: then lock present memory only.
     wanted = _LOCK_CURRENT | _LOCK_FUTURE if limit == resource.RLIM_INFINITY or _is_root() else _LOCK_CURRENT
     if lock(wanted) != 0:
         reason = os.strerror(ctypes.get_errno())
         return Setting(name, False, f"{reason}: the limit memlock is {_bytes(limit)}", SHELL_REMEDY)
     undo.callback(unlock)
     if wanted & _LOCK_FUTURE:
-        return Setting(name, True, "no page of the process waits for a disk")
-    return Setting(name, True, f"what is there now; what is allocated later is not (memlock is {_bytes(limit)})")
+        return Setting(name, True, "no page of the process is read from disk")
+    return Setting(name, True, f"present memory; later allocations are not locked (memlock is {_bytes(limit)})")
 
 
 def _take_core(undo: contextlib.ExitStack, core: int | None) -> Setting:
@@ -161,7 +161,7 @@ def _take_core(undo: contextlib.ExitStack, core: int | None) -> Setting:
     except (OSError, ValueError, OverflowError) as error:
         return Setting(name, False, f"core {core}: {error}", "choose one that /proc/self/status lists as allowed")
     undo.callback(os.sched_setaffinity, 0, before)
-    return Setting(name, True, f"core {core}; nothing keeps others off it (isolcpus would)")
+    return Setting(name, True, f"core {core}; other processes may still use it (isolcpus prevents that)")
 
 
 def _hold_idle_states(undo: contextlib.ExitStack) -> Setting:
@@ -173,7 +173,7 @@ def _hold_idle_states(undo: contextlib.ExitStack) -> Setting:
     except OSError as error:
         return Setting(name, False, f"{DMA_LATENCY}: {error.strerror}", f"sudo chmod o+w {DMA_LATENCY}")
     try:
-        os.write(file, bytes(4))  # an int32 of 0 us, which stands while the file is open
+        os.write(file, bytes(4))  # an int32 of 0 us, valid while the file is open
     except OSError as error:
         os.close(file)
         return Setting(name, False, f"{DMA_LATENCY}: {error.strerror}", f"sudo chmod o+w {DMA_LATENCY}")
@@ -191,7 +191,7 @@ def _cut_timer_slack(undo: contextlib.ExitStack) -> Setting:
         return Setting(name, False, os.strerror(ctypes.get_errno()))
     if before > 0:  # 0 of a real-time thread would mean "the default"
         undo.callback(prctl, _SET_TIMER_SLACK, ctypes.c_ulong(before), 0, 0, 0)
-    return Setting(name, True, f"instead of {before} ns" if before > 0 else "sleeps are not stretched")
+    return Setting(name, True, f"instead of {before} ns" if before > 0 else "sleeps are not extended")
 
 
 def _stop_collector(undo: contextlib.ExitStack) -> Setting:
@@ -202,7 +202,7 @@ def _stop_collector(undo: contextlib.ExitStack) -> Setting:
     undo.callback(gc.unfreeze)
     if was_on:
         undo.callback(gc.enable)
-    return Setting("garbage collector off", True, "what lives at the start is frozen, the loop makes no cycles")
+    return Setting("garbage collector off", True, "existing objects are frozen, the loop makes no cycles")
 
 
 def _is_root() -> bool:

@@ -1,11 +1,11 @@
-"""TIMESYNC: how far the other end's clock is ahead of ours, and how sure that is.
+"""Time sync (TIMESYNC): the offset of the other end's clock, and its error bound.
 
-A question carries our time (ts1) and tc1 = 0; the answer gives ts1 back beside the answerer's time (tc1). The offset is
-tc1 - (ts1 + arrival) / 2, wrong by half the round trip at most; of the newest answers the one with the shortest round trip
-is believed. Clocks drift, so that holds for the time of the answer: who needs other times has all answers.
+A request carries our time (ts1) and tc1 = 0; the response returns ts1 with the responder's time (tc1). The offset is
+tc1 - (ts1 + arrival) / 2, with an error of at most half the round trip; the estimate uses the newest responses, and of these
+the one with the shortest round trip. Clocks drift, so it holds for the time of that response; `answers` has them all.
 
-Source: the MAVLink time synchronisation service (v2), of which the released dialect has the fields tc1 and ts1 only: whose
-question an answer belongs to is told by its ts1.
+Source: the MAVLink time synchronisation service (v2), of which the released dialect has only the fields tc1 and ts1: a
+response is matched to its request by ts1.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ BURST = 10
 BURST_PERIOD_NS = 50_000_000
 PERIOD_NS = 1_000_000_000
 _REMEMBERED = 16
-"""Answers among which the best is chosen, and questions whose answers are still awaited."""
+"""Number of responses from which the best is chosen, and of requests whose responses are still awaited."""
 
 
 class Estimate(NamedTuple):
-    """offset_ns: the other clock less ours, then; round_trip_ns: twice the bound of its error; answers: how many came."""
+    """offset_ns: the other clock minus ours; round_trip_ns: twice its error bound; answers: number of responses."""
 
     offset_ns: int
     round_trip_ns: int
@@ -39,11 +39,11 @@ class Estimate(NamedTuple):
 
 
 class TimeSync:
-    """Asks and answers at one end of a link: a burst at the start, then once a second.
+    """Time sync at one end of a link: sends requests (a burst at the start, then one per second) and answers them.
 
-    seal: makes a frame of a message and its payload.
+    seal: makes a frame from a message and its payload.
 
-    answers   of each that came: our time half way between question and answer, the offset then, the round trip; ns
+    answers   for each response: our time half way between request and response, the offset, the round trip; ns
     """
 
     def __init__(self, seal: Callable[[Layout, bytes], bytes], clock: Clock) -> None:
@@ -53,10 +53,10 @@ class TimeSync:
         self.answers: list[tuple[int, int, int]] = []
         self._questions = 0
         self.next_ns = 0
-        """When the next question is due, on the clock."""
+        """When the next request is due, on the clock."""
 
     def question(self) -> bytes:
-        """The frame of a question asked now."""
+        """The frame of a request sent now."""
         now_ns = self._clock.now_ns()
         self._questions += 1
         self.next_ns = now_ns + (BURST_PERIOD_NS if self._questions < BURST else PERIOD_NS)
@@ -64,7 +64,7 @@ class TimeSync:
         return self._seal(mapping.TIMESYNC, mapping.encode_timesync(0, now_ns))
 
     def handle(self, frame: Frame, arrived_ns: int) -> bytes | None:
-        """Take a TIMESYNC that came at arrived_ns (0: now); the frame to answer a question with, else None."""
+        """Handle a TIMESYNC received at arrived_ns (0: now); returns the response to a request, else None."""
         arrived_ns = arrived_ns or self._clock.now_ns()
         answer_ns, asked_ns = mapping.decode_timesync(frame.payload)
         if answer_ns == 0:
@@ -78,7 +78,7 @@ class TimeSync:
 
     @property
     def estimate(self) -> Estimate | None:
-        """The offset by the best of the newest answers; None where none came yet."""
+        """The offset from the best of the newest responses; None without a response."""
         if not self.answers:
             return None
         _, offset_ns, round_trip_ns = min(self.answers[-_REMEMBERED:], key=lambda answer: answer[2])

@@ -1,4 +1,4 @@
-"""A trial of the machine: how late a process wakes that does nothing but keep a rate."""
+"""A test of the machine: the wake-up lateness of a process that only keeps a rate."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ NANOSECONDS = 1_000_000_000
 
 
 class Trial(msgspec.Struct, frozen=True):
-    """What came of a trial.
+    """Result of a trial.
 
     lateness_us  percentiles, counts by class and the spin, as `RateKeeper.summary` gives them
-    missed       whole periods that went by
+    missed       whole periods missed
     """
 
     rate_hz: float
@@ -35,7 +35,7 @@ class Trial(msgspec.Struct, frozen=True):
 def try_wake_ups(
     clock: Clock, rate_hz: float, seconds: float, core: int | None, *, realtime: bool
 ) -> tuple[Trial, Settings]:
-    """Keep a rate for some seconds, as an ordinary process or with all that `--realtime` asks for."""
+    """Keep a rate for some seconds, as an ordinary process or with the settings of `--realtime`."""
     period_ns = round(NANOSECONDS / rate_hz)
     with maybe_real_time(core, wanted=realtime) as settings:
         keeper = RateKeeper(clock, period_ns, choose_spin_ns(clock, period_ns, None, measure=has_own_core(settings)))

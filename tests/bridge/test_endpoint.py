@@ -136,6 +136,6 @@ def test_a_closed_link_says_so(pair: tuple[Endpoint, Endpoint]) -> None:
 
 def test_another_scenario_is_refused_and_both_digests_are_shown() -> None:
     refuse_other_scenario("emulator", b"12345678", b"12345678")
-    with pytest.raises(ScenarioMismatchError, match="the emulator holds another scenario") as caught:
+    with pytest.raises(ScenarioMismatchError, match="the emulator runs another scenario") as caught:
         refuse_other_scenario("emulator", bytes.fromhex("0011223344556677"), bytes.fromhex("8899aabbccddeeff"))
     assert "digest 0011223344556677, here 8899aabbccddeeff" in str(caught.value)

@@ -54,7 +54,7 @@ def test_every_command_says_so_in_one_line(
     ("arguments", "words"),
     [
         (("--clock", "realtime", "--speed", "2"), "leave one of them out"),
-        (("--speed", "0.001"), "is a tick every 4 s, for which no end waits: choose --speed 0.004 or more"),
+        (("--speed", "0.001"), "is a tick every 4 s, longer than the ends' timeouts: choose --speed 0.004 or more"),
     ],
 )
 def test_a_speed_that_cannot_be_kept_is_refused(
@@ -86,7 +86,7 @@ class TestDuration:
 
     @pytest.mark.parametrize("text", ["1.001s", "1001ms", "9" * 400 + "s"])
     def test_more_than_a_second_is_refused(self, text: str) -> None:
-        with pytest.raises(click.BadParameter, match="more than a second"):
+        with pytest.raises(click.BadParameter, match="longer than a second"):
             DurationNs().convert(text, None, None)
 
 

@@ -92,7 +92,7 @@ class TestFilling:
             (["--wait", "nan"], "--wait"),
             (["--speed", "0"], "--speed"),
             (["--drives", "none"], "'none' is not one of 'direct', 'bus'"),
-            (["--bus", "can1"], "--bus does nothing without --drives bus: add that, or leave --bus out"),
+            (["--bus", "can1"], "--bus has no effect without --drives bus: add it, or leave --bus out"),
             (["--core", "1"], "No such option"),
         ],
     )
@@ -142,7 +142,7 @@ class TestMistakesOfOurs:
         def both(plant: Plant, other: Other) -> None: ...
 
         both.__annotations__ = {"plant": Plant, "other": Other}
-        with pytest.raises(TypeError, match="--wait is declared twice, and not alike"):
+        with pytest.raises(TypeError, match="--wait is declared twice, in different ways"):
             command("both")(both)
 
     def test_one_flag_with_two_defaults_is_refused(self) -> None:

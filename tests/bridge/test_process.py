@@ -204,7 +204,7 @@ def test_what_another_process_left_in_the_folder_stays(
     """The figures of a run alone on this machine: its other half may be on another."""
     (tmp_path / file).write_text("before")
     assert run_command(cli, "fwav-hil", [*command, "--out", str(tmp_path)]) == 6
-    assert f"{file} is there already, and stays" in capsys.readouterr().err
+    assert f"{file} exists already and is not overwritten" in capsys.readouterr().err
     assert (tmp_path / file).read_text() == "before"
 
 

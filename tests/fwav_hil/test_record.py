@@ -232,13 +232,13 @@ class TestEnd:
         assert "a.tlog: 0 frames" in said.out
         # And nothing that is there is overwritten.
         assert fwav_hil("record", "--link", uri, "--out", "a.tlog", "--duration", "0.2") == 6
-        assert "a.tlog is there already" in capsys.readouterr().err
+        assert "a.tlog exists and is not overwritten" in capsys.readouterr().err
 
     @pytest.mark.parametrize(
         ("arguments", "code", "words"),
         [
             (("--link", "udpin://127.0.0.1:0", "--out", "no/such/a.tlog"), 6, "cannot write the log no/such/a.tlog"),
-            (("--link", "carrier://pigeon"), 2, "names no link"),
+            (("--link", "carrier://pigeon"), 2, "is not a link URI"),
             (("--link", "serial:///dev/nothing:57600"), 3, "/dev/nothing"),
             ((), 2, "--link"),
             (("--link", "udpin://127.0.0.1:0", "--duration", "0"), 2, "--duration"),

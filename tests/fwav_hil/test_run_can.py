@@ -136,7 +136,7 @@ def test_drives_that_end_before_the_run_does_end_it_at_once(tmp_path: Path) -> N
 def test_a_rate_that_does_not_fit_is_refused_before_anything_starts(tmp_path: Path) -> None:
     ended = call("run", "flapper", "--motor", "can", "--protocol", "mit", "--rate", "1000", cwd=tmp_path)
     assert ended.returncode == 2
-    assert_one_line(ended.stderr, "162 %", "does not fit", "500 Hz does")
+    assert_one_line(ended.stderr, "162 %", "does not fit", "500 Hz fits")
     assert not (tmp_path / "runs").exists()
 
 
@@ -196,7 +196,7 @@ def test_drives_alone_obey_a_controller_that_knows_only_the_published_dbc(tmp_pa
     ("option", "value", "words", "code"),
     [
         ("--can-log", "bus.txt", "choose a name that ends in .blf", 2),
-        ("--can-log", "there.log", "there.log exists already, and stays", 6),
+        ("--can-log", "there.log", "there.log exists already and is not overwritten", 6),
         ("--tap", "carrier-pigeon://x", "carrier-pigeon", 2),
     ],
 )

@@ -28,7 +28,7 @@ def test_without_a_bus_they_are_refused(
     assert run_command(cli, "fwav-hil", [command, "flapper", *option, *direct, "--out", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert f"{option[0]} does nothing without --motor can: add that" in said
+    assert f"{option[0]} has no effect without --motor can: add it" in said
     assert not (tmp_path / "run").exists()
 
 
@@ -36,4 +36,4 @@ def test_with_one_they_are_taken_wherever_motor_stands(capsys: pytest.CaptureFix
     """The URI of the bus is looked at, and is none: so far it came."""
     given = [word for option in GIVEN[1:] for word in option]
     assert run_command(cli, "fwav-hil", ["run", "flapper", "--can", "none", *given, "--motor", "can"]) == 2
-    assert "'none' names no CAN bus" in capsys.readouterr().err
+    assert "'none' is not a CAN bus URI" in capsys.readouterr().err

@@ -164,7 +164,7 @@ def test_no_permission_is_named(terminal: Terminal, monkeypatch: pytest.MonkeyPa
 
 def test_an_unknown_baud_rate_is_a_bad_uri(terminal: Terminal) -> None:
     uri = f"serial://{terminal.device}:{2**31}"
-    with pytest.raises(LinkUriError, match=f"'{uri}' names no link: .* does not know {2**31} baud"):
+    with pytest.raises(LinkUriError, match=f"'{uri}' is not a link URI: .* does not support {2**31} baud"):
         open_link(uri)
 
 

@@ -119,7 +119,7 @@ def test_a_taken_port_is_found_out(in_end: UdpIn) -> None:
 
 
 def test_a_foreign_address_cannot_be_bound() -> None:
-    with pytest.raises(LinkError, match=r"udpin://192\.0\.2\.1:0: 192\.0\.2\.1 is no address of this machine"):
+    with pytest.raises(LinkError, match=r"udpin://192\.0\.2\.1:0: 192\.0\.2\.1 is not an address of this machine"):
         open_link("udpin://192.0.2.1:0")
 
 

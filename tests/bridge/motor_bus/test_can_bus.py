@@ -113,7 +113,7 @@ def test_uris_are_read(text: str, parts: tuple[str, str, int, int]) -> None:
      "udp_multicast:239.0.0.1:70000", "udp_multicast:group", "udp_multicast:239.0.0.1?hop_limit=256"],
 )  # fmt: skip
 def test_what_names_no_bus_is_refused_with_an_example(text: str) -> None:
-    with pytest.raises(LinkUriError, match=r"names no CAN bus: .*write for example [a-z_]+:"):
+    with pytest.raises(LinkUriError, match=r"is not a CAN bus URI: .*write for example [a-z_]+:"):
         CanBus(text, 1_000_000)
 
 

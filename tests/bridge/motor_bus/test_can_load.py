@@ -64,13 +64,13 @@ def test_a_slower_bus_is_fuller_and_slower(protocol: str) -> None:
 
 
 def test_command_and_reply_at_1_khz_do_not_fit_and_what_does_is_said() -> None:
-    with pytest.raises(UsageError, match=r"six mit drives at 1000 Hz need 162 % .* 500 Hz does \(81 %\)"):
+    with pytest.raises(UsageError, match=r"six mit drives at 1000 Hz need 162 % .* 500 Hz fits \(81 %\)"):
         plan_bus("mit", Motor(), 1000.0)
     assert plan_bus("mit", Motor(), 500.0).loads[1_000_000] <= 1.0
 
 
 def test_a_faster_bus_is_proposed_where_it_helps() -> None:
-    with pytest.raises(UsageError, match=r"of 250 kbit/s .*motor.bitrate 500000 does \(56 %\) and 125 Hz does"):
+    with pytest.raises(UsageError, match=r"of 250 kbit/s .*motor.bitrate 500000 fits \(56 %\) and 125 Hz fits"):
         plan_bus("odrive", Motor(bitrate=250_000), 250.0)
 
 

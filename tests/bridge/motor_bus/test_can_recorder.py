@@ -26,7 +26,7 @@ def fill(recorder: CanRecorder) -> None:
 def test_a_full_disk_ends_the_run(tmp_path: Path) -> None:
     recorder = CanRecorder(tmp_path / "bus.log")
     with small_disk(ROOM):
-        with pytest.raises(RunFolderError, match=r"cannot write the record of the bus .*bus.log: File too"):
+        with pytest.raises(RunFolderError, match=r"cannot write the bus log .*bus.log: File too"):
             fill(recorder)
         recorder.close()  # as at the end of a run, whose error is the first one
 
@@ -36,7 +36,7 @@ def test_or_is_told_once_and_what_was_written_can_be_read(tmp_path: Path) -> Non
     with small_disk(ROOM):
         fill(CanRecorder(tmp_path / "bus.log", told.append))
     assert len(told) == 1
-    assert "cannot write the record of the bus" in told[0]
+    assert "cannot write the bus log" in told[0]
     whole = (tmp_path / "bus.log").read_text().rpartition("\n")[0] + "\n"
     (tmp_path / "bus.log").write_text(whole)
     with can.LogReader(tmp_path / "bus.log") as reader:

@@ -335,10 +335,10 @@ class TestLockstepWithDrivesAway:
             one.motors.meet(10.0)
             one.tick()
         with pytest.raises(
-            PeerLostError, match=r"the drives on virtual:.* gave no answer to the tick at t = 0\.004 s"
+            PeerLostError, match=r"the drives on virtual:.* did not answer the tick at t = 0\.004 s"
         ) as lost:
             one.tick()
-        assert "start them again with `fwav-hil motor SCENARIO --can virtual:" in str(lost.value)
+        assert "restart them with `fwav-hil motor SCENARIO --can virtual:" in str(lost.value)
         assert lost.value.exit_code == 4
         assert one.counted()["motor_resent"] == 1
         assert "motor_outages" not in one.counted()
@@ -356,7 +356,7 @@ class TestLockstepWithDrivesAway:
 
         monkeypatch.setattr(one.bus._bus, "send", gone)
         monkeypatch.setattr(one.bus, "_open", gone)
-        with pytest.raises(PeerLostError, match=r"\(the interface is away: no such device\)"):
+        with pytest.raises(PeerLostError, match=r"\(the interface is lost: no such device\)"):
             one.tick()
 
     def test_they_are_waited_for_8_s(self) -> None:
@@ -395,7 +395,7 @@ class TestLockstepWithDrivesAway:
             one.tick()
         with (
             MotorThread(short(lag_s=0.005), "odrive", uri),
-            pytest.raises(ScenarioMismatchError, match="hold another scenario"),
+            pytest.raises(ScenarioMismatchError, match="run another scenario"),
         ):
             for _ in range(2):
                 one.motors._waits_s = (0.02,) * 500
@@ -447,7 +447,7 @@ def test_drives_that_never_answer_leave_the_run_unarmed(rig: Callable[..., Rig])
 def test_drives_with_other_gears_are_refused(rig: Callable[..., Rig], uri: str) -> None:
     with (
         MotorThread(short(lag_s=0.005), "odrive", uri),
-        pytest.raises(ScenarioMismatchError, match="hold another scenario"),
+        pytest.raises(ScenarioMismatchError, match="run another scenario"),
     ):
         rig().motors.meet(10.0)
 

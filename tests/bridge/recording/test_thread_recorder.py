@@ -145,7 +145,7 @@ class TestLog:
     def test_nothing_that_is_there_is_overwritten(self, name: str, tmp_path: Path) -> None:
         refuse_existing_log(tmp_path / "a.tlog")
         (tmp_path / name).write_text("kept")
-        with pytest.raises(RunFolderError, match=f"{name} is there already"):
+        with pytest.raises(RunFolderError, match=f"{name} exists and is not overwritten"):
             refuse_existing_log(tmp_path / "a.tlog")
 
 

@@ -41,7 +41,7 @@ def test_this_machine_is_read_without_an_error() -> None:
     [
         ("#1 SMP PREEMPT_RT", {}, True, "PREEMPT_RT"),
         ("#1 SMP", {"sys__kernel__realtime": "1"}, True, "PREEMPT_RT"),
-        ("#1 SMP PREEMPT_DYNAMIC", {}, None, "not told"),
+        ("#1 SMP PREEMPT_DYNAMIC", {}, None, "model unknown"),
         ("#1 SMP PREEMPT_DYNAMIC", {"sys__kernel__debug__sched__preempt": "none voluntary (full)"}, True, "full"),
         ("#1 SMP PREEMPT_DYNAMIC", {"sys__kernel__debug__sched__preempt": "none (voluntary) full"}, False, "voluntary"),
         ("#1 SMP PREEMPT_DYNAMIC", {"proc__cmdline": "quiet preempt=none"}, False, "none"),
