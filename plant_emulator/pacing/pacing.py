@@ -62,17 +62,20 @@ class Pacing(abc.ABC):
         if not self._is_sent:
             self.begin(t_ns)
             self.send(t_ns)
+            self.owe_tick(t_ns)
         self._is_sent = False
         self.settle_books(t_ns)
         self.take_commands(t_ns)
         try:
             self.move(t_ns)
             following_ns = t_ns + self.period_ns
-            if self.sends_ahead and following_ns < self.end_ns:
+            self._is_sent = self.sends_ahead and following_ns < self.end_ns
+            if self._is_sent:
                 self.send(following_ns)
-                self._is_sent = True
         finally:
             self.log_received(t_ns)  # like all books, kept while the next tick is on its way
+        if self._is_sent:
+            self.owe_tick(following_ns)
         self.emulator.record(t_ns)
 
     sends_ahead = True
@@ -98,6 +101,9 @@ class Pacing(abc.ABC):
         self.datagram = self.emulator.sense(t_ns)
         self.sent_ns = self.clock.now_ns()
         self.endpoint.link.send(self.datagram)
+
+    def owe_tick(self, t_ns: int) -> None:
+        """Have the tick at t_ns, now sent, logged: after what came upon the tick before it."""
         self.owe_log(self.stamp_us(t_ns), self.emulator.frames())
 
     def process(self, data: bytes, t_ns: int) -> None:
