@@ -32,8 +32,8 @@ import platformdirs
 PACKAGES = ("protocol", "bridge", "controller", "plant_emulator", "fwav_hil")
 _ROOT = Path(__file__).resolve().parent.parent
 _DECORATORS = {"protocol.compiled.compiled", "protocol.compiled.inlined"}
-_KEPT_FOLDERS = 4
-"""Of each module: several checkouts may be in use."""
+_KEPT_FOLDERS = 12
+"""Of each module, 0.2 MB a piece: several checkouts may be in use, and edited."""
 _MOST_REMEMBERED = 5000
 
 

@@ -79,6 +79,7 @@ class MotorThread:
     """The drives in a thread of this process, for `virtual:` buses and tests; `with` starts and ends it."""
 
     def __init__(self, scenario: Scenario, protocol: str, uri: str) -> None:
+        warm_up(scenario, protocol)  # or the first tick waits for a compiler, and others for numba's lock on it
         self.node = MotorNode(scenario, protocol)
         self._bus = CanBus(uri, scenario.motor.bitrate)
         self._ending = threading.Event()

@@ -318,7 +318,8 @@ class TestTrust:
 class TestTidying:
     def test_of_each_module_the_folders_used_last_are_kept_and_the_older_ones_go(self, tree: Path) -> None:
         compiled = load(tree).kernel_folder("plant_emulator.tick").parent
-        for age in range(1, 8):
+        ages = range(1, 2 * ours._KEPT_FOLDERS)
+        for age in ages:
             for module in (MODULE, "protocol.rotations"):
                 old = compiled / f"{module}-used-{age}-days-ago"
                 old.mkdir()
@@ -327,9 +328,9 @@ class TestTidying:
         current = load(tree).kernel_folder(MODULE)
         assert {folder.name for folder in compiled.glob(f"{MODULE}-*")} == {
             current.name,
-            *(f"{MODULE}-used-{age}-days-ago" for age in (1, 2, 3)),
+            *(f"{MODULE}-used-{age}-days-ago" for age in ages[: ours._KEPT_FOLDERS - 1]),
         }
-        assert len(list(compiled.glob("protocol.rotations-*"))) == 7, "nobody has asked for a folder of theirs"
+        assert len(list(compiled.glob("protocol.rotations-*"))) == len(ages), "nobody has asked for a folder of theirs"
 
     def test_using_a_folder_makes_it_young_again(self, tree: Path) -> None:
         folder = load(tree).kernel_folder(MODULE)
