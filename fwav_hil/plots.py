@@ -22,9 +22,9 @@ _SHOWN = (
     ("x", 100.0, "cm"),
     ("y", 100.0, "cm"),
     ("z (down)", 100.0, "cm"),
-    ("roll α", 180.0 / np.pi, "deg"),
-    ("pitch β", 180.0 / np.pi, "deg"),
-    ("yaw γ", 180.0 / np.pi, "deg"),
+    ("roll", 180.0 / np.pi, "deg"),
+    ("pitch", 180.0 / np.pi, "deg"),
+    ("yaw", 180.0 / np.pi, "deg"),
 )
 _FORCES = (
     ("force x", 1e3, "mN"),

@@ -8,6 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from fwav_hil.axis_names import AXIS_NAMES
 from protocol.messages import AXES
 
 DEGREES = 180.0 / math.pi
@@ -77,7 +78,7 @@ def _tracking_table(summary: dict[str, Any]) -> Table:
         values = [summary["rmse"][axis], summary["mae"][axis]]
         if settled:
             values += [settled[axis], summary["mae_settled"][axis]]
-        table.add_row(axis, *(show_error(axis, value) for value in values))
+        table.add_row(AXIS_NAMES[axis], *(show_error(axis, value) for value in values))
     return table
 
 
@@ -98,5 +99,5 @@ def print_spread(spread: dict[str, Any], *, to_stderr: bool = False) -> None:
             name.replace("rmse_settled", "RMSE from 2 s").replace("rmse", "RMSE").replace("_", ", "), justify="right"
         )
     for axis in AXES:
-        table.add_row(axis, *(show_error(axis, spread[name][axis]) for name in columns))
+        table.add_row(AXIS_NAMES[axis], *(show_error(axis, spread[name][axis]) for name in columns))
     plain_console(to_stderr=to_stderr).print(table)

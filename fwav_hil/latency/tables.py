@@ -7,6 +7,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from fwav_hil.axis_names import AXIS_NAMES
 from fwav_hil.latency.analysis import LEGS
 from fwav_hil.tables import show_error
 from protocol.messages import AXES
@@ -58,7 +59,8 @@ def print_report(result: dict[str, Any], console: Console) -> None:
             console.print(beside["cyclictest"]["note"])
     if predicted := result["prediction"]:
         cells = ", ".join(
-            f"{axis} " + " / ".join(_show_error(axis, predicted[f"rmse_{which}"]) for which in RMSE) for axis in AXES
+            f"{AXIS_NAMES[axis]} " + " / ".join(_show_error(axis, predicted[f"rmse_{which}"]) for which in RMSE)
+            for axis in AXES
         )
         console.print(
             f"RMSE of the run / simulated with a constant delay of {1e3 * predicted['delay_s']:.3f} ms (the median) / with "

@@ -13,6 +13,7 @@ import tomli_w
 from rich.table import Table
 
 from bridge.process import StopFlag
+from fwav_hil.axis_names import AXIS_NAMES
 from fwav_hil.studies.design import (
     GROUPS,
     TABLES,
@@ -188,7 +189,7 @@ def print_design(result: Design, *, to_stderr: bool = False) -> None:
                 result.before.rmse_settled_median, result.after.rmse_settled_median,
             )
         ]  # fmt: skip
-        errors.add_row(axis, *cells)
+        errors.add_row(AXIS_NAMES[axis], *cells)
     console.print(errors)
     if result.before.lost:
         console.print(f"the old gains do not hold on this link: {result.before.lost}")

@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 
 from controller.laws.law import Law, make_law
+from fwav_hil.axis_names import AXIS_NAMES
 from fwav_hil.score import desired_positions, tracking_error
 from fwav_hil.simulate import Simulation, simulate
 from protocol.messages import AXES, FloatArray
@@ -65,7 +66,7 @@ def judge_flight(scenario: Scenario, result: Simulation) -> Flight:
     off = error > np.maximum(LOST_ERROR * swing, _NOISES * noise)
     lost = result.divergence
     if lost is None and saturated > LOST_SATURATED and off.any():
-        where = ", ".join(axis for axis, is_off in zip(AXES, off, strict=True) if is_off)
+        where = ", ".join(name for name, is_off in zip(AXIS_NAMES.values(), off, strict=True) if is_off)
         lost = f"{100.0 * saturated:.0f} % of the commands are at a limit and the error of {where} does not settle"
     return Flight(
         delay_s=scenario.delay_ns / NANOSECONDS,

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 import msgspec
 import numpy as np
 
+from fwav_hil.axis_names import AXIS_NAMES
 from fwav_hil.studies.loop_model import (
     Channel,
     channels,
@@ -181,9 +182,9 @@ def budget_line(scenario: Scenario, clock: str = "lockstep") -> Budget:
     left = most - delay_s
     warn = left < WARN_BELOW * most or most == 0.0
     if most == 0.0:
-        sentence = f"{head}the gains are unstable without any delay ({axis})"
+        sentence = f"{head}the gains are unstable without any delay ({AXIS_NAMES[axis]})"
     else:
-        sentence = f"{head}the gains stand {_ms(most)} ({axis}), {taken}, "
+        sentence = f"{head}the gains stand {_ms(most)} ({AXIS_NAMES[axis]}), {taken}, "
         sentence += f"{_ms(left)} left" if left >= 0.0 else f"{_ms(-left)} too much: unstable"
     if warn:
         why = "" if most == 0.0 or left < 0.0 else ": less than a third"
@@ -242,7 +243,7 @@ def judge(
     unusable: a channel is unstable, or the flight at this delay is lost (`lost`: why, or None). thin: a gain margin under 2
     either way, or a largest delay, linear or flown (`flown_delay_s`), under twice the delay.
     """
-    unstable = [axis for axis in AXES if not margins[axis].stable]
+    unstable = [AXIS_NAMES[axis] for axis in AXES if not margins[axis].stable]
     reasons = [f"linearly unstable in {', '.join(unstable)}"] if unstable else []
     if lost:
         reasons.append(f"the flight is lost: {lost}")
@@ -251,9 +252,9 @@ def judge(
     for axis in AXES:
         gain, most = margins[axis].gain_margin, margins[axis].max_delay_s
         if gain is not None and gain < LEAST_GAIN_MARGIN:
-            reasons.append(f"the gain margin of {axis} is {gain:.2f}")
+            reasons.append(f"the gain margin of {AXIS_NAMES[axis]} is {gain:.2f}")
         if most is not None and most < LEAST_DELAY_MARGIN * delay_s:
-            reasons.append(f"{axis} stands {most / delay_s:.2f} times the delay")
+            reasons.append(f"{AXIS_NAMES[axis]} stands {most / delay_s:.2f} times the delay")
     if flown_delay_s is not None and flown_delay_s < LEAST_DELAY_MARGIN * delay_s:
         reasons.append(f"the flown loop stands {flown_delay_s / delay_s:.2f} times the delay")
     return Verdict("thin" if reasons else "good", tuple(reasons))

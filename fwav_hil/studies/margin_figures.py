@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from fwav_hil.axis_names import AXIS_NAMES
 from fwav_hil.studies.describing import Gear, describing_function, gears
 from fwav_hil.studies.margin_study import Region, Study
 from plant_emulator.plant.backlash import gear_step
@@ -55,7 +56,7 @@ def draw_regions(path: Path, result: Study) -> Path:
         panel.set_yscale("log")
         panel.set_ylim(min(bottom, 0.7 * least * margin.gain_ratio), top)
         panel.set_xlim(-0.02e3 * region.delay_s[-1], 1e3 * region.delay_s[-1])
-        panel.set_title(", ".join(group))
+        panel.set_title(", ".join(AXIS_NAMES[axis] for axis in group))
         panel.set_xlabel("total delay (ms)")
         panel.set_ylabel("input gain g/b")
         panel.grid(visible=True, which="both", alpha=0.25)

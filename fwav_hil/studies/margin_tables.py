@@ -7,6 +7,7 @@ import math
 from rich.console import Console
 from rich.table import Table
 
+from fwav_hil.axis_names import AXIS_NAMES
 from fwav_hil.studies.margin import ChannelMargin
 from fwav_hil.studies.margin_study import Study
 from fwav_hil.tables import plain_console
@@ -44,7 +45,7 @@ def _channel_table(result: Study, delay_s: float) -> Table:
     for axis in AXES:
         margin = result.margins[axis]
         table.add_row(
-            axis if margin.stable else f"{axis}: unstable",
+            AXIS_NAMES[axis] if margin.stable else f"{AXIS_NAMES[axis]}: unstable",
             f"{margin.gain_ratio:.3f}",
             _range(margin),
             _factor(margin.gain_margin_up),
@@ -64,7 +65,7 @@ def _amplitude_table(result: Study) -> Table:
     )  # fmt: skip
     for group in _tightest(result):
         for number, row in enumerate(result.describing[group[0]]):
-            name = ", ".join(group) if number == 0 else ""
+            name = ", ".join(AXIS_NAMES[axis] for axis in group) if number == 0 else ""
             table.add_row(
                 name,
                 f"{row.amplitude:.2e} {_unit(group[0])}",
@@ -104,10 +105,10 @@ def _cycle_table(result: Study) -> Table:
             )
         cycles = [cycle for cycle in result.cycles[axis] if cycle.attracting]
         if not cycles:
-            table.add_row(axis, "none", "-", "-", *seen)
+            table.add_row(AXIS_NAMES[axis], "none", "-", "-", *seen)
         for cycle in cycles:
             table.add_row(
-                axis,
+                AXIS_NAMES[axis],
                 f"{cycle.amplitude:.2e} {_unit(axis)}",
                 f"{cycle.frequency_rad_s:.1f} rad/s",
                 _motion(axis, cycle.motion),

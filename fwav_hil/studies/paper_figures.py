@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from fwav_hil.axis_names import AXIS_NAMES
 from fwav_hil.score import tracking_error
 from fwav_hil.studies.lyapunov import lyapunov
 from fwav_hil.studies.paper import CENTIMETRES, Flight
@@ -43,7 +44,9 @@ def draw_comparisons(folder: Path, flights: dict[str, Flight]) -> list[Path]:
     """Figures 3-8 of one scenario; `flights` by condition name. Returns the PNG files."""
     files = []
     for number, channel, names in COMPARISONS:
-        figure, panel = _panel(f"Figure {number}: error of {channel}", "time (s)", f"error ({_unit(channel)})")
+        figure, panel = _panel(
+            f"Figure {number}: error of {AXIS_NAMES[channel]}", "time (s)", f"error ({_unit(channel)})"
+        )
         for name, colour in zip(names, COLOURS, strict=False):
             flight = flights[name]
             error = tracking_error(flight.scenario, flight.result.q)[:, AXES.index(channel)]
@@ -87,7 +90,7 @@ def draw_lyapunov(folder: Path, flight: Flight) -> Path:
         panel.semilogy(t, _positive(bound.bound[:, axis]), color=COLOURS[1], label="bound (30)")
         panel.semilogy(t, _positive(bound.comparison[:, axis]), color=COLOURS[2], label="y' = -rho y + C1(t)")
         panel.semilogy(t, _positive(bound.v1[:, axis]), color=COLOURS[0], linewidth=0.7, label="V1")
-        panel.set_title(AXES[axis])
+        panel.set_title(AXIS_NAMES[AXES[axis]])
         panel.grid(visible=True, alpha=0.3)
         if axis >= 3:
             panel.set_xlabel("time (s)")

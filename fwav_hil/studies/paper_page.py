@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fwav_hil.axis_names import AXIS_NAMES
 from fwav_hil.studies.lyapunov import Bound
 from fwav_hil.studies.paper import MEASURES, ORDERINGS, Claim, Row
 from protocol.messages import AXES
@@ -67,7 +68,7 @@ def markdown_page(
 
 
 def _shares(held: dict[str, float]) -> str:
-    return ", ".join(f"{axis} {100.0 * share:.1f} %" for axis, share in held.items())
+    return ", ".join(f"{AXIS_NAMES[axis]} {100.0 * share:.1f} %" for axis, share in held.items())
 
 
 def lyapunov_csv(t_ns: np.typing.NDArray[np.int64], bound: Bound) -> str:
@@ -89,7 +90,10 @@ def _claims_table(claims: Sequence[Claim]) -> str:
     lines.append("| --- | --- | --- | --- |")
     for name, *_ in ORDERINGS:
         cells = [claim for claim in claims if claim.claim == name]
-        failed = ", ".join(f"{claim.channel} {claim.measure.upper()}" for claim in cells if not claim.ours) or "-"
+        failed = (
+            ", ".join(f"{AXIS_NAMES[claim.channel]} {claim.measure.upper()}" for claim in cells if not claim.ours)
+            or "-"
+        )
         held = [sum(getattr(claim, whose) for claim in cells) for whose in ("paper", "ours")]
         lines.append(f"| {name} | {held[0]} of {len(cells)} | {held[1]} of {len(cells)} | {failed} |")
     return "\n".join(lines) + "\n"
@@ -104,7 +108,7 @@ def _table(title: str, rows: Sequence[Row]) -> str:
         for name in names:
             row = next(row for row in rows if (row.condition, row.channel) == (name, axis))
             cells += [_cell(getattr(row, f"paper_{measure}"), getattr(row, measure)) for measure in MEASURES]
-        lines.append(f"| {axis} | " + " | ".join(cells) + " |")
+        lines.append(f"| {AXIS_NAMES[axis]} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 

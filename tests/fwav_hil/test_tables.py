@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import pytest
 
+from fwav_hil.axis_names import AXIS_NAMES
 from fwav_hil.tables import plain_console, print_spread, print_summary, show_error
 from protocol.messages import AXES
 
@@ -71,7 +72,7 @@ class TestSummary:
         assert "2500 ticks at 250 Hz (10 s, lockstep), 3457 ticks/s of wall time" in text
         assert "missed 1, late 2, dropped 3, refused 4" in text
         assert rows(text) == {
-            axis: ["1.50 mm", "1.00 mm"] if axis in "xyz" else ["2.000 deg", "1.000 deg"] for axis in AXES
+            AXIS_NAMES[axis]: ["1.50 mm", "1.00 mm"] if axis in "xyz" else ["2.000 deg", "1.000 deg"] for axis in AXES
         }
         assert "latency" not in text
         assert "from 2 s" not in text
@@ -83,14 +84,14 @@ class TestSummary:
         assert "RMSE from 2 s" in text
         assert "MAE from 2 s" in text
         assert rows(text)["x"] == ["1.50 mm", "1.00 mm", "0.30 mm", "0.20 mm"]
-        assert rows(text)["gamma"] == ["2.000 deg", "1.000 deg", "0.300 deg", "0.200 deg"]
+        assert rows(text)["yaw"] == ["2.000 deg", "1.000 deg", "0.300 deg", "0.200 deg"]
 
     def test_what_is_not_known_is_a_dash_or_left_out(self, capsys: pytest.CaptureFixture[str]) -> None:
         empty = by_axis(None, None)
         unknown = {"clock": None, "ticks_per_s": None, "rmse": empty, "mae": empty, "counters": {}, "ticks": 0}
         print_summary(summary(**unknown))
         text = capsys.readouterr().out
-        assert rows(text) == {axis: ["-", "-"] for axis in AXES}
+        assert rows(text) == {AXIS_NAMES[axis]: ["-", "-"] for axis in AXES}
         assert "0 ticks at 250 Hz (10 s)\n" in text
         assert "None" not in text
         assert "missed" not in text
@@ -135,7 +136,7 @@ class TestSpread:
         assert "RMSE, worst" in text
         assert "2 s" not in text
         assert rows(text) == {
-            axis: ["1.00 mm", "2.00 mm"] if axis in "xyz" else ["1.000 deg", "2.000 deg"] for axis in AXES
+            AXIS_NAMES[axis]: ["1.00 mm", "2.00 mm"] if axis in "xyz" else ["1.000 deg", "2.000 deg"] for axis in AXES
         }
 
     def test_the_settled_part_has_columns_of_its_own(self, capsys: pytest.CaptureFixture[str]) -> None:

@@ -147,10 +147,10 @@ class TestVerdict:
         ("changes", "lost", "flown", "verdict", "reason"),
         [
             ({}, None, 0.025, "good", ""),
-            ({"stable": False}, None, 0.025, "unusable", "linearly unstable in beta"),
+            ({"stable": False}, None, 0.025, "unusable", "linearly unstable in pitch"),
             ({}, "it fell", 0.0, "unusable", "it fell"),
-            ({"gain_margin": 1.9}, None, 0.025, "thin", "gain margin of beta is 1.90"),
-            ({"max_delay_s": 0.0199}, None, 0.025, "thin", "beta stands 1.99 times the delay"),
+            ({"gain_margin": 1.9}, None, 0.025, "thin", "gain margin of pitch is 1.90"),
+            ({"max_delay_s": 0.0199}, None, 0.025, "thin", "pitch stands 1.99 times the delay"),
             ({}, None, 0.0199, "thin", "the flown loop stands 1.99"),
             ({"max_delay_s": None, "gain_margin": None}, None, None, "good", ""),
         ],
