@@ -14,7 +14,7 @@ Trigger: TypeAlias = Literal["sample", "clock"]
 class ControllerOptions(EndOptions, frozen=True, kw_only=True):
     """How the process runs.
 
-    link: a URI, or `-` to read it from standard input once everything is ready. core: the one to have with `realtime`.
+    link: a URI, or `-`: read from standard input once everything is ready. core: the processor core to run on with `realtime`.
     """
 
     link: Annotated[str, Option(
@@ -22,12 +22,12 @@ class ControllerOptions(EndOptions, frozen=True, kw_only=True):
     )] = DEFAULT_CONTROLLER_LINK  # fmt: skip
     trigger: Annotated[Trigger, Option(
         "--trigger",
-        "With --clock realtime the controller steps on each sample as it comes, or on a clock of its own with the "
-        "newest one."
+        "With --clock realtime: step on each sample as it arrives (sample), or on the controller's own clock with "
+        "the newest sample (clock)."
     )] = "sample"  # fmt: skip
     arm: Annotated[bool, Option(
         "--arm/--no-arm",
-        "Arm as soon as the emulator shows the same scenario, or wait for MAV_CMD_COMPONENT_ARM_DISARM."
+        "Arm once the emulator has reported the same scenario, or wait for MAV_CMD_COMPONENT_ARM_DISARM."
     )] = True  # fmt: skip
     station: Station = None
     out: Annotated[Path | None, folder_option("Folder for the counters.")] = None

@@ -1,8 +1,8 @@
-"""The scenario's numbers as MAVLink parameters: gains, which may be set while disarmed; scales, limits and gears, to be read.
+"""The scenario's numbers as MAVLink parameters: gains, settable while disarmed; scales, limits and gears, read only.
 
 A name is PREFIX_SYMBOL_AXIS, 16 characters at most; a law's file names its own gains (`controller.laws.gains`). `python -m
-controller.parameters` prints the table of docs/station.md with the gains of every law. Values travel as float32; a set that
-asks for what is there already (to float32) changes nothing, so that a gain keeps its every digit.
+controller.parameters` prints the table of docs/station.md with the gains of every law. Values are sent as float32; setting
+a value that equals the present one in float32 changes nothing, so that a gain keeps its full precision.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ AXIS_NAMES = ("X", "Y", "Z", "ROLL", "PITCH", "YAW")
 
 
 class Parameter(NamedTuple):
-    """One parameter: its name, its place in the scenario (axis None: no field of six), what it is.
+    """One parameter: its name, its place in the scenario (axis None: the field is one number, not six), its type.
 
-    table: "" is the scenario itself; `gains.NAME` one of the gains of a law.
+    table: "" is the scenario itself; `gains.NAME` a table of gains of a law.
     """
 
     name: str
@@ -58,7 +58,7 @@ _GROUPS = (
     Group("LAW_ROTATE", "control", "rotate_force", "1: the force is rotated into the body", Kind.INT32, False, True),
     Group("LAW_INDEX", "", "law", "number of the law", Kind.INT32, False),
     Group("LAW_RATE_HZ", "", "rate_hz", "rate of the law, Hz", Kind.REAL32, False),
-    Group("ACT_SCALE", "actuators", "scale", "what a control of 1 stands for, N, N m"),
+    Group("ACT_SCALE", "actuators", "scale", "force or torque of a control of 1, N, N m"),
     Group("ACT_LOWER", "actuators", "lower", "least command, N, N m"),
     Group("ACT_UPPER", "actuators", "upper", "largest command, N, N m"),
     Group("HYS_H", "hysteresis", "h", "slope of the gears (2), (3)"),
@@ -68,7 +68,7 @@ _GROUPS = (
 )
 
 _FIRST = tuple(f"LAW_{name}" for name in ("K", "LAMBDA", "B", "T", "N", "KP", "KD", "UHAT0", "ROTATE", "ORDER"))
-"""Order of the indices: these first, as in the logs there are, then the other groups above, then the gains of later laws."""
+"""Order of the indices: these first, as in existing logs, then the other groups above, then the gains of later laws."""
 
 
 @functools.cache
@@ -100,7 +100,7 @@ def _table(scenario: Scenario, name: str) -> Any:
 def parameters_of(scenario: Scenario) -> tuple[Parameter, ...]:
     """The scenario's parameters, in the order of their indices.
 
-    Of the gears those that its model has; of the laws' gains those of its law, and of each table that it has for others.
+    Gear parameters are those of the scenario's gear model; gains are those of its law and of every other gains table it has.
     """
     found = []
     for group in _groups(declared_gains(scenario)):
@@ -121,7 +121,7 @@ def value_of(scenario: Scenario, parameter: Parameter) -> float:
 
 
 def _like(old: object, value: float) -> float:
-    """A value off the link as the type that the scenario holds; what does not fit is left for the scenario to refuse."""
+    """A received value converted to the type that the scenario holds; what does not fit is left for the scenario to reject."""
     if isinstance(old, bool):
         return bool(value) if value in (0.0, 1.0) else value
     return int(value) if isinstance(old, int) and float(value).is_integer() else value
@@ -137,14 +137,14 @@ def changed(scenario: Scenario, parameter: Parameter, value: float) -> Scenario:
     if not parameter.table.startswith("gains."):
         return with_overrides(scenario, **{parameter.table: {**table, parameter.field: new}})
     other = replace_gains(scenario, parameter.table.removeprefix("gains."), **{parameter.field: new})
-    _table(other, parameter.table)  # as the law would read it
+    _table(other, parameter.table)  # read as the law reads it
     return other
 
 
 def followed(scenario: Scenario, said: Collection[tuple[str, float | None]]) -> Scenario:
-    """The scenario with the gains that (name, value) of a log's PARAM_VALUE say: only what differs, to float32, is changed.
+    """The scenario with the gains of a log's PARAM_VALUE messages, (name, value): only values that differ in float32 change.
 
-    Raises ScenarioError where a value is none that could have been set.
+    Raises ScenarioError where a value is out of range.
     """
     by_name = {parameter.name: parameter for parameter in parameters_of(scenario)} if said else {}
     for name, value in said:
@@ -157,11 +157,11 @@ def followed(scenario: Scenario, said: Collection[tuple[str, float | None]]) -> 
 
 
 class Parameters:
-    """The parameters of one controller, as they are now.
+    """The current parameters of one controller.
 
     apply: takes the scenario with a changed gain, or raises an error of the project and changes nothing.
 
-    counters   parameters_set       values that were changed        parameters_refused   sets and reads that were not obeyed
+    counters   parameters_set       values that were changed        parameters_refused   set and read requests rejected
     """
 
     def __init__(self, scenario: Scenario, apply: Callable[[Scenario], None]) -> None:
@@ -176,17 +176,17 @@ class Parameters:
         return self._index.get(name)
 
     def value(self, index: int) -> float:
-        """The value of a parameter now."""
+        """The current value of a parameter."""
         return value_of(self.scenario, self.table[index])
 
     def saying(self, index: int) -> tuple[Layout, bytes]:
-        """PARAM_VALUE of a parameter now."""
+        """PARAM_VALUE with the current value of a parameter."""
         parameter = self.table[index]
         payload = encode_value(parameter.name, parameter.kind, self.value(index), index, len(self.table))
         return VALUE, payload
 
     def set(self, index: int, kind: int, value: float, *, armed: bool) -> Refusal | None:
-        """Set a parameter; None where it now has the value, else why it has not. The caller counts refusals."""
+        """Set a parameter; None on success, else the reason for rejecting it. The caller counts rejections."""
         parameter = self.table[index]
         if kind != parameter.kind:
             return Refusal.OUT_OF_RANGE

@@ -1,4 +1,4 @@
-"""The controller as a process: wait for samples, have the tick answer them, and keep time."""
+"""The controller as a process: wait for samples, have `Tick` answer them, and keep time."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ RESULT = "controller.json"
 STATION_FILE = "station_controller.tlog"
 LOOK_PERIOD_S = 0.1
 PATIENCE_PERIODS = 1.5
-"""In real time a sample that is this late counts as missing: the last command is then given again."""
+"""In real time a sample that is this many periods late counts as missing: the last command is sent again."""
 
 
 class Controller:
-    """One law in front of one link.
+    """One law on one link.
 
-    The law's period is the scenario's, whatever the emulator's is: periods without a sample are made up for, and a sample
-    that comes before its period is over is answered with the command that stands.
+    The law's period is the scenario's, even where the emulator's differs: the law also steps through periods without a
+    sample, and a sample that arrives before its period is over is answered with the last command.
 
-    keeper     of its own clock, with trigger `clock`
-    counters   late_samples     real time: periods in which no sample came in time
-               reused_samples   trigger clock: steps for which no new sample was there, so that the last command stood
+    keeper     schedule of its own clock, with trigger `clock`
+    counters   late_samples     real time: periods in which no sample arrived in time
+               reused_samples   trigger clock: steps without a new sample, at which the last command was sent again
     """
 
     def __init__(
@@ -94,11 +94,11 @@ class Controller:
         self._run_began_ns = clock.now_ns(), processor_time_ns()
 
     def run(self) -> None:
-        """Meet the emulator, then answer its samples until it says that the run is over."""
+        """Meet the emulator, then answer its samples until it reports the end of the run."""
         self.session.meet(self._listen, lambda: self.source.t_ns >= 0, self.clock, self.options.wait_s, self.stop)
         self._run_began_ns = self.clock.now_ns(), processor_time_ns()
         if self.keeper:
-            self.keeper.resume()  # where in the emulator's period this clock ticks is chance, as between two machines
+            self.keeper.resume()  # the phase of this clock within the emulator's period is random, as between two machines
         while not self.session.ended:
             self.stop.check()
             if self.keeper:
@@ -107,7 +107,7 @@ class Controller:
                 self._step_by_sample()
 
     def _step_by_sample(self) -> None:
-        """Answer what comes next; in real time a sample that is late has the last command given again, each period."""
+        """Answer the next sample; in real time, while a sample is late, send the last command again once a period."""
         begun_ns = self.clock.now_ns()
         self._ask_the_time(begun_ns)
         late = self.session.is_silent and not self._lockstep
@@ -121,7 +121,7 @@ class Controller:
             self.tick.repeat()
 
     def _step_by_clock(self, keeper: RateKeeper) -> None:
-        """At the next deadline of this end's own clock answer the newest sample, or give the last command again."""
+        """At the next deadline of the controller's own clock answer the newest sample, or send the last command again."""
         begun_ns = self.clock.now_ns()
         heard = False
         while not self.session.ended and (wait_s := keeper.remaining_s()) is not None:
@@ -143,7 +143,7 @@ class Controller:
             self.tick.repeat()
 
     def _listen(self, timeout_s: float) -> None:
-        """Hear the link and the station, before the first sample."""
+        """Receive from the link and the ground station, before the first sample."""
         data = self._receive(timeout_s)
         if data:
             self._process(data)
@@ -151,7 +151,7 @@ class Controller:
             self.station.poll(0)
 
     def _process(self, data: bytes) -> None:
-        """Have the tick take what came, then see to what can wait until the answer is on its way."""
+        """Have `Tick` process the received bytes, then do what can wait until the answer has been sent."""
         self.session.heard()
         self.tick.process(data)
         if self.station and self.tick.answered_ns >= self._look_ns:
@@ -159,7 +159,7 @@ class Controller:
             self._look_ns = self.station.next_ns
 
     def _send(self, answer: bytes) -> None:
-        """Send an answer, and note when it and its sample were where."""
+        """Send an answer, and record the time stamps of it and of its sample."""
         link = self.endpoint.link
         if not self.legs:
             link.send(answer)
@@ -177,14 +177,14 @@ class Controller:
             self.endpoint.send([self.time_sync.question()])
 
     def _count_silence(self, begun_ns: int) -> None:
-        """Count a wait, begun then, in which nothing came. Raises PeerLostError after 3 s of them."""
+        """Count a wait, begun at that time, in which nothing arrived. Raises PeerLostError after 3 s of such waits."""
         if self.station:
             self.station.poll(self.tick.answered_ns)
         waited_ns = self.clock.now_ns() - begun_ns
         self.session.count_silence(waited_ns, round(2e9 * self._patience_s), self.tick.answered_ns)
 
     def _receive(self, timeout_s: float) -> bytes | None:
-        """What comes within the timeout, or None; in real time it polls around the time at which a sample is due."""
+        """The bytes received within the timeout, or None; in real time it polls around the time at which a sample is due."""
         link, clock = self.endpoint.link, self.clock
         try:
             if self._lockstep:
@@ -214,12 +214,12 @@ class Controller:
         return recv(max(0, end_ns - now_ns()) * 1e-9)
 
     def processor_share(self) -> float:
-        """The share of a core that the run has taken since its first sample."""
+        """The share of a core that the run has used since its first sample."""
         wall_ns, processor_ns = self._run_began_ns
         return (processor_time_ns() - processor_ns) / max(1, self.clock.now_ns() - wall_ns)
 
     def summary(self) -> dict[str, int]:
-        """Everything counted at this end, by name."""
+        """All counters of the controller, by name."""
         return {
             **self.endpoint.counters(),
             **self.source.counters(),
@@ -234,7 +234,7 @@ class Controller:
 
 
 def warm_up(scenario: Scenario, law: Law) -> None:
-    """Have every kernel of the loop compiled (or loaded) before the emulator waits for an answer."""
+    """Compile every kernel of the loop (or load it from the cache) before the emulator waits for an answer."""
     near, far = memory_pair()
     with near, far:
         endpoint = Endpoint(near, *VEHICLE)
@@ -249,12 +249,12 @@ def warm_up(scenario: Scenario, law: Law) -> None:
 def run_controller(scenario: Scenario, options: ControllerOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
     """Build the scenario's law, open the link and `serve`.
 
-    Raises the errors of `protocol.errors`; a law that needs velocities is refused.
+    Raises the errors of `protocol.errors`; UsageError for a law that needs velocities.
     """
     refuse_on_a_link(scenario)
     law = make_law(scenario.law, scenario)
     if options.legs and (options.clock != "realtime" or not options.out):
-        raise UsageError("--legs notes times of a real-time run in a folder: add --clock realtime and --out DIR")
+        raise UsageError("--legs writes time stamps of a real-time run to a folder: add --clock realtime and --out DIR")
     if options.out:
         take_folder(options.out, RESULT, CONTROLLER_FILE)
     warm_up(scenario, law)
@@ -269,17 +269,17 @@ def run_controller(scenario: Scenario, options: ControllerOptions, report: Repor
 
 
 def _told_link() -> str:
-    """The URI on the first line of standard input. Raises Interrupted where it ends without one."""
+    """The URI on the first line of standard input. Raises Interrupted where the input ends without one."""
     uri = sys.stdin.readline().strip()
     if not uri:
-        raise Interrupted("interrupted before a link was named on standard input")
+        raise Interrupted("interrupted before a link was given on standard input")
     return uri
 
 
 def serve(
     scenario: Scenario, law: Law, link: Link, options: ControllerOptions, report: Report, stop: StopFlag
 ) -> dict[str, Any]:
-    """Run a law in front of whatever emulator is at the link; returns the summary of this end.
+    """Run a law with the emulator on the link; returns the controller's summary.
 
     Raises the errors of `protocol.errors`, after the summary is written.
     """

@@ -1,7 +1,7 @@
 """The controller's session with the emulator: meet, agree on the scenario, arm, watch, leave.
 
-It speaks as a MAVLink vehicle. It starts disarmed. It arms when told to at its start (`--arm`) and the emulator holds the
-same scenario, or by MAV_CMD_COMPONENT_ARM_DISARM from a ground station.
+To its peers it is a MAVLink vehicle. It starts disarmed. With `--arm` it arms once the emulator has reported the same
+scenario; otherwise MAV_CMD_COMPONENT_ARM_DISARM from a ground station arms it.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from protocol.wire.streams import HEARTBEAT_TIMEOUT_NS
 OFFERED = ("HEARTBEAT", "AUTOPILOT_VERSION")
 """Messages that are sent on request."""
 PARAMETERS_HZ = 50.0
-"""How many parameters a second are said at the start of a run, one with an answer at most."""
+"""How many parameters a second are sent at the start of a run, at most one with each answer."""
 HELLO_PERIOD_S = 0.1
 
 
 class HilSession:
-    """Heartbeats, arming, the scenario's digest; and each parameter once from the first tick on, so that a log explains itself.
+    """Heartbeats, arming, the scenario's digest; from the first tick on also each parameter once, so that the log has them all.
 
     who        our own (system, component)             emulator   the peer's
-    encoders   of the further streams that travel with the answers       time_sync   in real time: who answers TIMESYNC
+    encoders   of the other streams sent with the answers                time_sync   in real time: answers TIMESYNC
 
-    armed      commands are live                       agreed     the emulator has shown the same scenario
-    ended      the emulator has said that the run is over
-    schedule   what is said on the loop's link besides the answers
-    commands   what it obeys, on any link              requests   what is asked of it on the loop's link
+    armed      commands act                            agreed     the emulator has reported the same scenario
+    ended      the emulator has reported the end of the run
+    schedule   messages sent on the loop's link besides the answers
+    commands   those it obeys, on any link             requests   those received on the loop's link
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class HilSession:
     def meet(
         self, listen: Callable[[float], None], met: Callable[[], bool], clock: Clock, wait_s: float, stop: StopFlag
     ) -> None:
-        """Say hello until the first sample is there (`met`) or the run is over; `listen` hears the link for a time (s).
+        """Send heartbeats until the first sample arrives (`met`) or the run ends; `listen` receives for a time (s).
 
         Raises PeerMissingError, Interrupted.
         """
@@ -105,7 +105,7 @@ class HilSession:
         )
 
     def due_frames(self, t_ns: int) -> list[bytes]:
-        """Heartbeat, answers, and what was asked for, as far as they are due at t_ns."""
+        """Heartbeat, replies and requested messages that are due at t_ns."""
         if t_ns < self.schedule.next_ns:
             return []
         return [self._endpoint.seal(*saying) for saying in self.schedule.due(t_ns)]
@@ -127,33 +127,33 @@ class HilSession:
                 self._endpoint.send([answer])
 
     def heard(self) -> None:
-        """Take note that the peer has just been heard."""
+        """Note that a frame of the peer has just arrived."""
         self._silence_ns = 0
 
     @property
     def is_silent(self) -> bool:
-        """Whether the last wait was in vain."""
+        """Whether nothing arrived during the last wait."""
         return self._silence_ns > 0
 
     def count_silence(self, waited_ns: int, most_ns: int, t_ns: int) -> None:
-        """Add up a wait in which nothing came, after the sample of t_ns. Raises PeerLostError after 3 s of them.
+        """Add up a wait in which nothing arrived, after the sample of t_ns. Raises PeerLostError after 3 s of such waits.
 
-        One by one, each for `most_ns` at most: a stall of the whole machine then counts as one wait, not as silence.
+        Each wait counts for `most_ns` at most, so that a stall of the whole machine counts as one wait, not as silence.
         """
         self._silence_ns += min(waited_ns, most_ns)
         if self._silence_ns > HEARTBEAT_TIMEOUT_NS:
             raise PeerLostError(
                 f"the emulator at {self._endpoint.link.uri} fell silent for 3 s after t = {t_ns * 1e-9:.3f} s: "
-                "see whether it still runs"
+                "check that it still runs"
             )
 
     def say_parameter(self, index: int) -> None:
-        """Say a parameter that was changed on the loop's link, and so in the run's log, with the next answer."""
+        """Send a changed parameter on the loop's link, and so to the run's log, with the next answer."""
         self._changed.append(index)
         self.schedule.ask_once(VALUE.message_id)
 
     def arm_or_disarm(self, request: Request) -> Result:
-        """Obey MAV_CMD_COMPONENT_ARM_DISARM: disarm at any time, arm once the emulator has shown the same scenario."""
+        """Obey MAV_CMD_COMPONENT_ARM_DISARM: disarm at any time, arm once the emulator has reported the same scenario."""
         wanted = wanted_arming(request)
         if wanted is None or (wanted and not self.agreed):
             return Result.DENIED
@@ -161,7 +161,7 @@ class HilSession:
         return Result.ACCEPTED
 
     def _next_parameters(self, _t_ns: int) -> list[Saying]:
-        """Those that were changed; else the next of those that have not been said yet."""
+        """The parameters that were changed; else the next one that has not been sent yet."""
         indices, self._changed = self._changed, []
         if not indices and self._unsaid:
             indices = [self._unsaid.popleft()]

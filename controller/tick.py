@@ -1,7 +1,7 @@
-"""The controller's part of a tick, in its one order: receive, hear the others, answer, send, note.
+"""The controller's part of a tick, always in this order: receive, handle other frames, answer, send, record.
 
-The live process, the replay of a log into the controller, and the tests call this; the simulation in one process strings
-the same kernels together.
+The live process, the replay of a log into the controller, and the tests call this; the in-process simulation calls
+the same kernels.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _SAMPLE, _AGAIN = Found.SAMPLE, Found.AGAIN
 
 
 class Session(Protocol):
-    """What a tick needs to know of whoever the controller works with."""
+    """What a tick needs to know of the session with the peer."""
 
     armed: bool
 
@@ -31,18 +31,18 @@ class Session(Protocol):
         """React to a frame that carries no pose."""
 
     def due_frames(self, t_ns: int) -> list[bytes]:
-        """What else travels with the answer to the sample of t_ns, in front of the command."""
+        """Frames sent with the answer to the sample of t_ns, before the command."""
 
 
 class Tick:
     """Answers the samples of a source with a law, through a sink.
 
-    send       takes the answer to a sample, whole
+    send       called with the complete answer to a sample
     at_once    answer each sample as it is read; else the newest is kept (`is_fresh`) until `answer` is called
 
     answered_ns   time of the sample answered last; -1 before the first
-    counters      repeated         answers given again, because their tick came again or the next one is missing
-                  skipped_samples  samples of which a newer one came before they were answered
+    counters      repeated         answers sent again, because their tick arrived again or the next one is missing
+                  skipped_samples  samples not answered because a newer one had arrived
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Tick:
         self.counters = {"repeated": 0, "skipped_samples": 0}
 
     def process(self, data: bytes) -> None:
-        """Take all that came, in its order on the wire. Raises what the session raises upon a frame."""
+        """Process the received bytes in the order on the wire. Raises what the session raises for a frame."""
         source = self.source
         source.feed(data)
         while True:
@@ -88,13 +88,13 @@ class Tick:
                 return
 
     def answer(self) -> None:
-        """Step the law on the newest sample and send what it asks for; a law that was disarmed starts anew."""
+        """Step the law on the newest sample and send its command; after being disarmed the law starts anew."""
         t_ns, armed = self.source.t_ns, self.session.armed
         if not (armed and self._was_armed):
-            self.law.restart(self.state)  # what a disarmed law remembers never acted
+            self.law.restart(self.state)  # the commands in a disarmed law's state never acted
         self._was_armed = armed
         if self.answered_ns < 0:
-            self._writer.sequence = 0  # the numbers of the run begin with its first answer
+            self._writer.sequence = 0  # the run's sequence numbers begin with its first answer
         due = self.session.due_frames(t_ns)
         command = self.sink.answer(self.law, self.state, t_ns, self.source.q, armed=armed)
         self.is_fresh = False
@@ -103,7 +103,7 @@ class Tick:
         self._send(self._last)
 
     def repeat(self) -> None:
-        """Give the last answer again, the same bytes, without a step of the law."""
+        """Send the last answer again, the same bytes, without stepping the law."""
         if self._last:
             self.counters["repeated"] += 1
             self._send(self._last)

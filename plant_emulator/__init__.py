@@ -1,1 +1,1 @@
-"""The plant emulator: rigid body, gear hysteresis, sensors, safety, and the process that speaks for them on a link."""
+"""The plant emulator: rigid body, gear hysteresis, sensors, safety, and the process that connects them to a link."""

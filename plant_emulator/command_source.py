@@ -1,4 +1,4 @@
-"""Commands from the controller: HIL_ACTUATOR_CONTROLS, held against the ticks that they may answer, in compiled code."""
+"""Commands from the controller, compiled: HIL_ACTUATOR_CONTROLS, checked against the ticks that they may answer."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from protocol.wire.mapping import ARMED, COMMAND, read_command
 
 
 class Found(enum.IntEnum):
-    """Why the reading stopped."""
+    """Why reading stopped."""
 
     NOTHING = 0
     """all that was given has been read"""
     COMMAND = 1
-    """a command that may act is there"""
+    """a command that may act has arrived"""
     OTHERS = 2
-    """other frames are to be heard before it reads on"""
+    """other frames have to be handled before it reads on"""
 
 
 CAUSES = ("refused_commands", "old_commands", "repeated", "unknown_echoes")
@@ -64,7 +64,7 @@ def receive(
         elif echo_us < max(oldest_us, s.newest_us):
             counters[OLD] += 1
         else:
-            if s.newest_us < 0:  # the controller's numbers restart with its first answer
+            if s.newest_us < 0:  # the controller's sequence numbers restart with its first answer
                 r.follow = 1
                 r.next[:] = -1
                 r.next[row.system << 8 | row.component] = (row.sequence + 1) & 0xFF
@@ -76,19 +76,19 @@ def receive(
 
 
 class CommandSource:
-    """Reads what the loop's link delivers; only commands of the controller at `sender` are believed.
+    """Reads what the loop's link delivers; only commands of the controller at `sender` are accepted.
 
-    newest      (6,) the newest command that may act, as it came
-    newest_ns   time of the tick that it answers; negative before the first     armed   whether it may act at all
+    newest      (6,) the newest command that may act, as received
+    newest_ns   time of the tick that it answers; negative before the first     armed   whether it was sent armed
     is_read     whether all that was fed has been read
-    others      frames that are no commands, since they were last taken: somebody else hears them
-    memory      what the kernels share of it: its fields newest (6,) and armed
-    raws        every intact frame since they were last taken, as it was on the wire: for the log
+    others      frames that are no commands, since they were last collected: the caller handles them
+    memory      what the kernels share: its fields newest (6,) and armed
+    raws        every intact frame since they were last collected, as it was on the wire: for the log
 
-    counters    refused_commands  commands with a control that is not a number
+    counters    refused_commands  commands rejected because a control is not a number
                 old_commands      commands that answer a tick before the oldest that may still be answered
-                repeated          commands that came again: they stand, and do not count as fresh
-                unknown_echoes    commands that answer no tick that was sent
+                repeated          commands received again: they remain in force, and do not count as fresh
+                unknown_echoes    commands whose time is not that of a tick that was sent
     """
 
     def __init__(self, reader: FrameReader, sender: tuple[int, int], scale: FloatArray, period_ns: int) -> None:
@@ -120,15 +120,15 @@ class CommandSource:
         self.newest: FloatArray = self.memory["newest"][0]
 
     def expect(self, oldest_ns: int, latest_ns: int) -> None:
-        """From now on a command may answer the ticks from oldest_ns to latest_ns, if it is newer than the newest."""
+        """From now on accept commands that answer the ticks from oldest_ns to latest_ns and are newer than the newest."""
         self._oldest_us, self._latest_us = oldest_ns // 1000, latest_ns // 1000
 
     def feed(self, data: bytes) -> None:
-        """Take the next bytes of the link."""
+        """Accept the next bytes of the link."""
         self._data, self._at = self._reader.whole(data), 0
 
     def read(self) -> Found:
-        """Read on, up to the next command that may act; see `receive`."""
+        """Continue reading, up to the next command that may act; see `receive`."""
         data, begun = self._data, self._at
         found, self._at, count, newest_us, self.armed = receive(
             data, begun, *self._arguments, self._oldest_us, self._latest_us
@@ -136,7 +136,7 @@ class CommandSource:
         self.newest_ns = newest_us * 1000
         self.is_read = self._at == len(data)
         if count == 1 and found == COMMANDED and self.is_read and not self._offsets.item(0):
-            self.raws.append(data)  # as nearly always
+            self.raws.append(data)  # the usual case
             return Found.COMMAND
         if count:
             frames = [frame_of(data, row) for row in self._rows[:count].tolist()]
@@ -150,9 +150,9 @@ class CommandSource:
 
     @property
     def strays(self) -> int:
-        """How many commands were refused, whatever the cause."""
+        """How many commands were rejected in all."""
         return int(self.memory["counters"][0].sum())
 
     def counters(self) -> dict[str, int]:
-        """What was refused, by cause."""
+        """The rejected commands, by cause."""
         return dict(zip(CAUSES, self.memory["counters"][0].tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""How an emulator process runs, and one of drives on a CAN bus."""
+"""How an emulator process runs, and a process of drives on a CAN bus."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ DEFAULT_CAN = "udp_multicast:239.74.163.2"
 
 
 class MotorScenarioChoice(ScenarioChoice, frozen=True, kw_only=True):
-    """A scenario, with what the command line changes in its drives too."""
+    """A scenario, with the command line's changes to its drives too."""
 
     protocol: Annotated[str | None, Option(
-        "--protocol", "What the drives speak, instead of the scenario's protocol.", type=click.Choice(list(PROTOCOLS)),
+        "--protocol", "Motor protocol of the drives, instead of the scenario's.", type=click.Choice(list(PROTOCOLS)),
         only_with=_WITH_A_BUS
     )] = None  # fmt: skip
     lag_s: Annotated[float | None, Option(
@@ -56,7 +56,7 @@ class MotorLink(msgspec.Struct, frozen=True, kw_only=True):
     can: CanUri = DEFAULT_CAN
     feedback: Annotated[Literal["sync", "bus"], Option(
         "--feedback",
-        "What the plant gets: every bit of the force behind the gears, or what the protocol's own status shows of it.",
+        "What the plant gets: the exact force after the gears (sync), or as the motor protocol reports it (bus).",
         only_with=_WITH_A_BUS
     )] = "sync"  # fmt: skip
     log: Annotated[Path | None, Option(
@@ -64,7 +64,7 @@ class MotorLink(msgspec.Struct, frozen=True, kw_only=True):
         "FILE", type=FILE, only_with=_WITH_A_BUS
     )] = None  # fmt: skip
     tap: Annotated[str | None, Option(
-        "--tap", "Show the bus as CAN_FRAME to a station on this MAVLink link (udpin://, tcpin://).", "URI",
+        "--tap", "Forward the bus as CAN_FRAME to a station on this MAVLink link (udpin://, tcpin://).", "URI",
         only_with=_WITH_A_BUS
     )] = None  # fmt: skip
 
@@ -79,29 +79,29 @@ class MotorOptions(msgspec.Struct, frozen=True, kw_only=True):
 class EmulatorOptions(EndOptions, frozen=True, kw_only=True):
     """How the process runs.
 
-    speed: None is as fast as it goes. delay_ns: what comes is taken so much later. truth_hz: as if the peer had asked for it.
-    bus: where the drives are, with `motor` "can". core: the one to have with `realtime`.
+    speed: None: as fast as possible. delay_ns: added to the arrival of data. truth_hz: as if the peer had requested it.
+    bus: where the drives are, with `motor` "can". core: the processor core to run on with `realtime`.
     """
 
     link: Annotated[str, Option(
         "--link", "Where the controller is: udpin://, udpout://, tcpin://, tcpout://, serial:///dev/x:baud.", "URI"
     )] = DEFAULT_EMULATOR_LINK  # fmt: skip
     speed: Annotated[float | None, Option(
-        "--speed", "Pace lockstep to X times real time; without it, as fast as it goes.", "X", min=0.001
+        "--speed", "Pace lockstep to X times real time; by default it runs as fast as possible.", "X", min=0.001
     )] = None  # fmt: skip
     profile: Annotated[Literal["exact", "tolerant"], Option(
         "--profile",
-        "Lockstep that waits for each answer of our controller, or bears with an autopilot that answers in its own "
-        "time."
+        "Lockstep that waits for each answer (exact), or steps on without an answer that is late (tolerant: for other "
+        "autopilots)."
     )] = "exact"  # fmt: skip
     delay_ns: DelayNs = 0
     truth_hz: Annotated[float | None, Option(
         "--truth",
-        "Say the true state on the link, and so in the log, at this rate: HIL_STATE_QUATERNION and ODOMETRY.", "HZ",
+        "Send the true state on the link, and so to the log, at this rate: HIL_STATE_QUATERNION and ODOMETRY.", "HZ",
         min=0.1
     )] = None  # fmt: skip
     motor: Annotated[Literal["direct", "can"], Option(
-        "--motor", "Motors and gears in the emulator, or in drives on a CAN bus."
+        "--motor", "Motors and gears inside the emulator (direct), or in drives on a CAN bus (can)."
     )] = "direct"  # fmt: skip
     bus: MotorLink = MotorLink()
     station: Station = None
@@ -111,5 +111,5 @@ class EmulatorOptions(EndOptions, frozen=True, kw_only=True):
 
     @property
     def motors(self) -> MotorLink | None:
-        """How the drives are reached; None where they are in the plant itself."""
+        """How the drives are reached; None where motors and gears are in the plant."""
         return self.bus if self.motor == "can" else None

@@ -1,4 +1,4 @@
-"""The emulator as a process: meet the controller, run the ticks, end cleanly, say what happened."""
+"""The emulator as a process: meet the controller, run the ticks, end cleanly, report the results."""
 
 from __future__ import annotations
 
@@ -45,35 +45,35 @@ STATION_FILE = "station_emulator.tlog"
 HELLO_PERIOD_S = 0.1
 PROGRESS_PERIOD_NS = 100_000_000
 FAREWELLS = 3
-"""Times the end is said, since a datagram may be lost."""
+"""How often the end of the run is sent, since a datagram may be lost."""
 
 
 def run_emulator(scenario: Scenario, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
     """Open the link and `fly`. Raises the errors of `protocol.errors`."""
     if options.clock != "realtime" and (options.delay_ns or options.legs):
         raise UsageError(
-            "--delay and --legs are of real time: add --clock realtime (in lockstep the delay is the scenario's, [delay])"
+            "--delay and --legs need real time: add --clock realtime (in lockstep the scenario's [delay] applies)"
         )
     if options.profile == "tolerant" and (options.clock != "lockstep" or options.motors):
         raise UsageError(
-            "--profile tolerant is of lockstep, with the gears in the plant: leave out --clock realtime and --motor can"
+            "--profile tolerant needs lockstep with the gears in the plant: leave out --clock realtime and --motor can"
         )
     if options.legs and not options.out:
-        raise UsageError("--legs needs a folder for the time stamps: add --out DIR")
+        raise UsageError("--legs writes time stamps to a folder: add --out DIR")
     warm_up(scenario)
     with open_patiently(options.link, options.wait_s, stop) as link:
         if options.clock == "lockstep":
             link.spin_s = options.spin_s or 0.0
         if options.legs or options.delay_ns:
-            link.stamp_receives()  # a delay counts from the arrival, not from when we got round to it
+            link.stamp_receives()  # a delay counts from the arrival, not from when the process reads it
         delayed = DelayedLink(link, options.delay_ns, MonotonicClock()) if options.delay_ns else link
         return fly(scenario, signed(delayed, options.key), options, report, stop)
 
 
 def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
-    """Run a scenario against whatever controller comes to the link; returns the summary of this end.
+    """Run a scenario with the controller that connects to the link; returns the emulator's summary.
 
-    The log, the ground truth and this summary (in `options.out`) are complete up to the end, whatever that end is. Raises
+    The log, the ground truth and this summary (in `options.out`) are complete up to the end, also after an error. Raises
     the errors of `protocol.errors`.
     """
     log = truth = None
@@ -116,7 +116,7 @@ def fly(scenario: Scenario, link: Link, options: EmulatorOptions, report: Report
 def _open_files(
     scenario: Scenario, link: Link, options: EmulatorOptions, out: Path, report: Report
 ) -> tuple[TlogWriter | None, TruthWriter | None]:
-    """Begin the log and the ground truth of a run; None each where the disk refuses and the user chose to go on."""
+    """Open the log and the ground truth of a run; None each where writing fails and the user chose to continue."""
     tell = _teller(options, report)
     source = {
         "scenario": scenario.name,
@@ -145,14 +145,14 @@ def _open_files(
 
 
 def _teller(options: EmulatorOptions, report: Report) -> Callable[[str], None] | None:
-    """Who hears of a disk that refuses, where the user chose to go on; None: it ends the run."""
+    """The function that reports a failed write, where the user chose to continue; None: a failed write ends the run."""
     if options.on_log_error != "continue":
         return None
-    return lambda sentence: report({"event": "warning", "text": f"{sentence}; the run goes on"})
+    return lambda sentence: report({"event": "warning", "text": f"{sentence}; the run continues"})
 
 
 def warm_up(scenario: Scenario) -> None:
-    """Have every kernel of a run compiled (or loaded) before a controller waits for an answer."""
+    """Compile every kernel of a run (or load it from the cache) before a controller waits for an answer."""
     near, far = memory_pair()
     with near, far:
         endpoint = Endpoint(near, *VEHICLE)
@@ -173,7 +173,7 @@ def warm_up(scenario: Scenario) -> None:
 def _motors(
     scenario: Scenario, options: EmulatorOptions, report: Report, stop: StopFlag
 ) -> contextlib.AbstractContextManager[CanMotors | None]:
-    """The drives behind a bus, where there is one: python-can is loaded only then."""
+    """The drives on a CAN bus, if any: python-can is loaded only then."""
     if options.motors is None:
         return contextlib.nullcontext()
     from plant_emulator.drives.motor_setup import open_motors
@@ -193,7 +193,7 @@ def _motors(
 def _pacing(scenario: Scenario, options: EmulatorOptions, parts: Parts, settings: Settings) -> Pacing:
     if options.clock == "realtime":
         spin_ns = choose_spin_ns(parts.clock, scenario.period_ns, options.spin_s, measure=has_own_core(settings))
-        through = not options.motors and parts.endpoint.link.stamp_receives()  # drives on a bus are told at once
+        through = not options.motors and parts.endpoint.link.stamp_receives()  # drives on a bus get commands at once
         return RealTime(parts, spin_ns=spin_ns, sleeps_through=through, added_delay_ns=options.delay_ns)
     keeper = RateKeeper(parts.clock, round(scenario.period_ns / options.speed)) if options.speed else None
     if options.profile == "tolerant":
@@ -280,7 +280,7 @@ def _say_farewell(emulator: Emulator, pacing: Pacing, t_ns: int) -> None:
 
 
 def _close_files(log: TlogWriter | None, truth: TruthWriter | None) -> None:
-    """Close both files, the second one even where the first cannot be written."""
+    """Close both files, the second one even if writing the first fails."""
     problem: RunFolderError | None = None
     for file in (log, truth):
         try:

@@ -1,7 +1,7 @@
-"""The emulator towards a ground station: heard without waiting, told what it asks for over its own link.
+"""The emulator as a ground station sees it: its requests are polled without waiting and answered on its own link.
 
-Who asks on the loop's link is answered there, in the datagram of a tick and so in the run's log; what a ground station asks
-for burdens the loop with nothing.
+Requests on the loop's link are answered there, in the datagram of a tick and so in the run's log; a ground station's
+requests add nothing to the loop's link.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from protocol.due import NEVER, Due
 from protocol.wire.schedule import Encoder, Saying, Schedule
 
 RPM_HZ = 10.0
-"""Of RAW_RPM to a ground station, unless it asks for another rate."""
+"""Rate of RAW_RPM to a ground station, unless it requests another."""
 
 
 class EmulatorStation:
     """Answers the requests of a ground station, if there is one.
 
-    encoders   of the messages that it may ask for
-    next_ns    until then there is nothing to do
+    encoders   of the messages that it may request
+    next_ns    time before which there is nothing to do
     """
 
     def __init__(self, station: Station | None, who: tuple[int, int], encoders: Mapping[str, Encoder]) -> None:
@@ -32,13 +32,13 @@ class EmulatorStation:
         self.next_ns = 0 if station else NEVER
 
     def answer(self) -> None:
-        """Hear the station and answer it, before the first tick, where nothing else is due."""
+        """Handle and answer the station's requests before the first tick, when nothing else is due."""
         if self._station:
             self._hear(self._station, 0)
             self._tell(self._station, self._schedule.answers())
 
     def poll(self, t_ns: int) -> None:
-        """Hear the station as often as POLL_HZ says, and tell it what is due at t_ns."""
+        """Handle the station's requests at POLL_HZ, and send it the messages due at t_ns."""
         if self._station:
             if self._look.at(t_ns):
                 self._hear(self._station, t_ns)
@@ -55,5 +55,5 @@ class EmulatorStation:
             station.say(*saying)
 
     def counters(self) -> dict[str, int]:
-        """What the station's link has counted."""
+        """The counters of the station's link."""
         return self._station.counters() if self._station else {}

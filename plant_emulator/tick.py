@@ -1,7 +1,7 @@
-"""The emulator's part of a tick, in its one order: envelope, drives, record and move, frames that are due, measure and seal.
+"""The emulator's part of a tick, always in this order: safety envelope, drives, record and move, due frames, measure, seal.
 
-It knows nothing of how time is kept; that is `pacing`. To the outside it speaks only messages. The live process and the
-replay of a log into the plant call it; the simulation in one process strings the same kernels together.
+Time is kept by `pacing`, not here. Its only interface to the outside is messages. The live process and the
+replay of a log into the plant call it; the in-process simulation calls the same kernels.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from protocol.wire.schedule import Encoder, Saying, Schedule
 from protocol.wire.tick_frames import write_tick
 from protocol.wire.truth_mapping import ODOMETRY, RPM, STATE, encode_odometry, encode_rpm, encode_state
 
-if TYPE_CHECKING:  # what a run without a CAN bus need not load
+if TYPE_CHECKING:  # not needed for a run without a CAN bus
     from bridge.motor_bus.drives import CanMotors
 
 TRUTH = (STATE, ODOMETRY)
@@ -48,7 +48,7 @@ ACT, MOVE, MEASURE = 1, 2, 4
 
 @compiled
 def act(envelope: Any, state: PlantState, t_ns: int, acts_ns: int, tau: FloatArray, armed: bool) -> bool:
-    """Let what the envelope leaves of a command that came at t_ns act from acts_ns on; False: too many are on their way."""
+    """Let a command received at t_ns, limited by the envelope, act from acts_ns on; False: too many commands are pending."""
     pass_command(envelope, t_ns, tau, armed)
     return push_command(state, acts_ns, envelope.allowed)
 
@@ -82,9 +82,9 @@ def _steps(
 class Emulator:
     """Plant, sensors and safety envelope of one run.
 
-    motors     drives behind a CAN bus, which then have the gears; None: motors and gears are the plant's
-    source     commands from the link                 schedule   what is said on the loop's link besides the ticks
-    station    what a ground station asks for, on a link of its own
+    motors     drives on a CAN bus, which then contain the gears; None: motors and gears are in the plant
+    source     commands from the link                 schedule   messages sent on the loop's link besides the ticks
+    station    requests of a ground station, on a link of its own
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class Emulator:
         self._sealed = b""
 
     def say_truth(self, rate_hz: float) -> None:
-        """Have the true state said on the loop's link from now on, as if its peer had asked for that."""
+        """Send the true state on the loop's link from now on, as if the peer had requested it."""
         for message in TRUTH:
             self.schedule.set_rate(message.message_id, rate_hz)
 
@@ -153,12 +153,12 @@ class Emulator:
             self.requests.handle(frame)
 
     def answers(self) -> list[Saying]:
-        """What is to be answered before the first tick, where nothing else is due; the station is seen to as well."""
+        """Replies due before the first tick, when nothing else is due; the station's requests are handled too."""
         self.station.answer()
         return self.schedule.answers()
 
     def sense(self, t_ns: int) -> bytes:
-        """The tick at t_ns as one datagram: the frames that are due, the pose, the tick; `frames` has them one by one."""
+        """The tick at t_ns as one datagram: the frames that are due, the pose, the tick; `frames` gives them one by one."""
         writer = self._endpoint.writer
         due: list[bytes] = []
         if t_ns >= self.schedule.next_ns:
@@ -178,10 +178,10 @@ class Emulator:
         return [*self._due, self._sealed[: self._middle], self._sealed[self._middle :]]
 
     def act(self, arrival_ns: int, delay_ns: int) -> None:
-        """Let the newest command, which came at simulation time arrival_ns, act delay_ns later, within the envelope.
+        """Let the newest command, received at simulation time arrival_ns, act delay_ns later, within the envelope.
 
-        It waits for `advance`; where another command may come before that, `settle` follows. Raises DivergenceError, now or
-        then, where too many commands are on their way.
+        It is applied by `advance`, or before, by `settle`. Raises DivergenceError, now or then, where too many commands are
+        pending.
         """
         if self.motors:
             allowed = self.safety.pass_command(arrival_ns, self.source.newest, armed=self.source.armed)
@@ -211,14 +211,14 @@ class Emulator:
             self.plant.arrive(end_ns, outcome)
 
     def _drive(self, t_ns: int, acts_ns: int, tau: FloatArray) -> None:
-        """Let tau (6,), asked for at t_ns, act from acts_ns on."""
+        """Let tau (6,), commanded at t_ns, act from acts_ns on."""
         if self.motors:
             acts_ns += self.motors.delay_ns
-            tau = self.motors.drive(t_ns, tau, acts_ns)  # the force behind the gears: the plant takes it as it is
+            tau = self.motors.drive(t_ns, tau, acts_ns)  # the force after the gears, which acts on the plant as it is
         self.plant.command(acts_ns, tau)
 
     def check_staleness(self, t_ns: int, delay_ns: int = 0) -> None:
-        """Turn to the safe output, as late as any command acts, where none has come for too long."""
+        """Switch to the safe output, with the delay of a command, when the last command is stale."""
         self.settle()
         stale = self.safety.stale_output(t_ns)
         if stale is not None:
@@ -227,9 +227,9 @@ class Emulator:
             self._drive(acts_ns, acts_ns, output)
 
     def advance(self, end_ns: int) -> None:
-        """Note the tick's row and integrate to the next one, which is measured too where nothing else is due with it.
+        """Fill the tick's row and integrate to the next tick, which is measured too if nothing else is due with it.
 
-        `record` follows. Raises DivergenceError, the row being recorded.
+        `record` follows. Raises DivergenceError, the row recorded.
         """
         t_ns = self.plant.t_ns
         alone = end_ns < self.schedule.next_ns and end_ns < self.station.next_ns
@@ -240,24 +240,24 @@ class Emulator:
             raise
 
     def hold(self, end_ns: int) -> None:
-        """Note the tick's row and let time pass with the plant where it is."""
+        """Fill the tick's row and let time pass with the plant held in place."""
         self._run(MOVE, self.plant.t_ns)
         self.plant.t_ns = end_ns
 
     def record(self, t_ns: int) -> None:
-        """Keep the row of the tick at t_ns, which `advance` or `hold` has noted."""
+        """Write the row of the tick at t_ns, which `advance` or `hold` has filled."""
         if self.motors:
             self._row[19:25] = self.motors.tau_at(t_ns)
         if self._truth:
             self._truth.append(t_ns, self._row)
 
     def flush(self) -> None:
-        """Hand the ground truth so far to the system."""
+        """Flush the ground truth written so far to the operating system."""
         if self._truth:
             self._truth.flush()
 
     def all_counters(self) -> dict[str, int]:
-        """Everything counted, by name."""
+        """All counters, by name."""
         asked = {name: count + self.station.requests.counters[name] for name, count in self.requests.counters.items()}
         return {
             **self._endpoint.counters(),

@@ -73,11 +73,11 @@ def exponential(matrix: FloatArray) -> FloatArray:
 
 
 def estimator(order: int, T: float, b: float, period: float, *, derivatives: int) -> Estimator:
-    """The estimator of (18) with G_f of that order; `derivatives` is 2 where m = q, 1 where m = q' (T, period in s).
+    """The estimator of (18) with G_f of the given order; `derivatives` is 2 where m = q, 1 where m = q' (T, period in s).
 
     With p = Ts and T^j uhat = (p^j m - b T^j tau)/A(p), j = derivatives, in observer form: the state is shifted by the
-    first-order hold's share of the newest sample, w = x - G_2 m, so that sample k acts at step k. The order is `derivatives`
-    at least.
+    first-order hold's share of the newest sample, w = x - G_2 m, so that sample k acts at step k. The order is at least
+    `derivatives`.
     """
     size = order
     falling = butterworth(order)[1:]  # a_(n-1) .. a_0
@@ -128,8 +128,8 @@ def realise(
 ) -> Realisation:
     """The matrices of a law with k_0 = error_gain, k_1 = rate_gain (6,), f = feed_forward, c = compensate.
 
-    Without compensation the constant bias -uhat0 stands in for the estimate: gravity feed-forward. For output feedback the
-    filters are `Filters`, whose order is high enough.
+    Without compensation the constant bias -uhat0 replaces the estimate: gravity feed-forward. For output feedback the
+    filters are `Filters`, which checks their order.
     """
     control = scenario.control
     derivatives = 1 if state_feedback else 2

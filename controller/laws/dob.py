@@ -3,8 +3,8 @@
     b tau = -b Kp q_e - b Kd D q_e - uhat                 `dob`, as far as the paper describes it
     b tau = q_d'' - b Kp q_e - b Kd D q_e - uhat          `dob_ff`, with feed-forward
 
-With b Kp = K Lambda and b Kd = K + Lambda the second *is* the UDE, digit for digit: every gap between the two comes from
-the baseline's gains or from its missing feed-forward.
+With b Kp = K Lambda and b Kd = K + Lambda the second *is* the UDE, digit for digit: every difference between the two comes
+from the baseline's gains or from its missing feed-forward.
 """
 
 from __future__ import annotations

@@ -19,11 +19,11 @@ class StateFeedbackFilters(Table, frozen=True):
 
 
 class Filters(StateFeedbackFilters, frozen=True):
-    """The same for output feedback, which differentiates G_f twice: as the paper says below (21)."""
+    """The same for output feedback, which differentiates G_f twice (see the paper, below (21))."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.order < 2:
             raise ValueError(
-                f"output feedback needs a filter of order 2 or more, this one has {self.order}: set order = 2"
+                f"output feedback needs a filter of order 2 or more, but order is {self.order}: set order = 2"
             )

@@ -5,11 +5,11 @@ sampling period by the law's own file (`ude`, `pd`, `dob`):
 
     tau_k    = C x_k + D r_k + bias          r = [q, q_e, q_d'', q', q_e']   (the last two for state feedback only)
     x_(k+1)  = A x_k + B r_k + B_tau tau_applied_k
-    uhat_k   = C_u x_k + D_u r_k             the estimate of u_d, for the log and for taking up again after a gap
+    uhat_k   = C_u x_k + D_u r_k             the estimate of u_d, for the log and for restarting after a gap
 
-then the rotation of the force into the body, the limits, float32 as on the wire, and the value so applied rotated back
-into the observer: that is the anti-windup. The HIL process, the in-process simulation and the margin study all use this
-object. x[0], what happens at the start and after missing samples: see `_start_axis` and `control_step`.
+Then the force is rotated into the body, limited and rounded to float32 as on the wire; the applied value is rotated back
+and fed to the observer (anti-windup). The HIL process, the in-process simulation and the margin study all use this
+object. For x_0 at the start and after missing samples see `_start_axis` and `control_step`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from protocol.wire.mapping import command_from_wire, command_to_wire
 
 
 class Output(NamedTuple):
-    """What happens between the linear law and the wire: limits and scale (6,), body frame; rotation on or off."""
+    """From the linear law to the wire: limits and scale (6,), body frame; whether the force is rotated into the body."""
 
     lower: FloatArray
     upper: FloatArray
@@ -40,15 +40,15 @@ class Output(NamedTuple):
 
 
 class LawState(NamedTuple):
-    """All that a law remembers, changed in place.
+    """The state of a law, changed in place.
 
     x         (6, n)  states of the realisation
     q         (6,)    last measured position and attitude, angles unwrapped
     applied   (6,)    tau applied last, inertial frame
     uhat      (6,)    last estimate
-    tau       (6,)    last command, body frame, exactly as the wire carries it
+    tau       (6,)    last command, body frame, exactly as sent on the wire
     desired   (3, 6)  q_d, q_d', q_d'' at the last sample
-    t_ns      (1,)    the law's own time: that of the first sample and whole periods since
+    t_ns      (1,)    the law's own time: that of the first sample plus whole periods
     fresh     (1,)    not zero: the next sample starts the law
     counts    (4,)    STEPS, MISSED, RESTARTS, SATURATED
     r         (6, INPUTS)  inputs of the last step
@@ -117,10 +117,10 @@ def _step_states(law: Realisation, state: LawState) -> None:
 
 @compiled
 def begin_sample(law: Realisation, period_ns: int, state: LawState, t_ns: int, measured: FloatArray) -> int:
-    """Take the sample `measured` (6,) of time t_ns, its angles unwrapped; returns the periods since the last one.
+    """Accept the sample `measured` (6,) of time t_ns, its angles unwrapped; returns the periods since the last one.
 
-    0: the sample comes before its period is due by half, so nothing changes and the command stands. Periods are counted
-    from the first sample on, which begins the law's own time.
+    0: the sample arrives more than half a period early, so nothing changes and the last command remains. Periods are
+    counted from the first sample, which begins the law's own time.
     """
     first = state.fresh[0] != 0
     periods = 1
@@ -137,7 +137,7 @@ def begin_sample(law: Realisation, period_ns: int, state: LawState, t_ns: int, m
 
 @compiled
 def coast(law: Realisation, state: LawState, part: float, velocity: FloatArray) -> None:
-    """Step through a period of which no sample came: q on the line from the last sample to this one, at `part` of it.
+    """Step through a period without a sample: q is interpolated between the last sample and this one, at fraction `part`.
 
     tau is held. state.desired holds the reference at the end of that period.
     """
@@ -150,10 +150,10 @@ def coast(law: Realisation, state: LawState, part: float, velocity: FloatArray) 
 
 @compiled
 def law_output(law: Realisation, state: LawState, gap_s: float, velocity: FloatArray) -> None:
-    """What the law asks for upon the sample begun, inertial frame, in state.tau; its estimate in state.uhat.
+    """Compute the law's command for the sample begun, inertial frame, in state.tau; its estimate in state.uhat.
 
-    state.desired (3, 6) holds the reference at the time of the sample. An axis whose memory_s the gap reaches starts again
-    from its last estimate; every axis does at the first sample, from uhat0.
+    state.desired (3, 6) holds the reference at the time of the sample. An axis restarts from its last estimate where the gap
+    reaches its memory_s; at the first sample every axis starts from uhat0.
     """
     first = state.fresh[0] != 0
     restarted = False
@@ -181,7 +181,7 @@ def law_output(law: Realisation, state: LawState, gap_s: float, velocity: FloatA
 
 @compiled
 def law_advance(law: Realisation, period_ns: int, state: LawState, t_ns: int, periods: int) -> None:
-    """Move on to the next period; state.applied (6,) holds what really acts until then, inertial frame."""
+    """Advance to the next period; state.applied (6,) holds the command that really acts until then, inertial frame."""
     _step_states(law, state)
     for axis in range(6):
         state.q[axis] = state.scratch[0, axis]
@@ -192,7 +192,7 @@ def law_advance(law: Realisation, period_ns: int, state: LawState, t_ns: int, pe
 
 @compiled
 def limit_on_the_wire(output: Output, state: LawState, measured: FloatArray) -> None:
-    """Turn state.tau into the body frame and into what HIL_ACTUATOR_CONTROLS carries of it; that acts: state.applied."""
+    """Rotate state.tau into the body frame, limit and round it as HIL_ACTUATOR_CONTROLS does; state.applied is the result."""
     tau = state.tau
     alpha, beta, gamma = measured[3], measured[4], measured[5]
     if output.rotate_force:
@@ -224,9 +224,9 @@ def control_step(
 ) -> None:
     """One step of the law on the sample `measured` (6,) of time t_ns; the command is then in state.tau (6,), body frame.
 
-    The reference comes in as data, the output stands apart from the advance with what really acts: another sink puts its
-    own limits between the two. Periods without a sample are stepped all at once before (q linear, tau held), unless the gap
-    is as long as the longest memory_s. `velocity` (6,) is read by state-feedback laws only.
+    The reference is passed in as data. The output is separate from the advance with what really acts, so that another sink
+    can apply its own limits in between. Periods without a sample are stepped first, all at once (q linear, tau held), unless
+    the gap is as long as the longest memory_s. `velocity` (6,) is read by state-feedback laws only.
     """
     periods = begin_sample(law, period_ns, state, t_ns, measured)
     if periods < 1:
@@ -254,7 +254,7 @@ class Law:
     """A control law ready to run: data plus one step function.
 
     name            as in the registry (`controller.laws.registry`)
-    needs_velocity  state feedback: it exists in the in-process simulation only
+    needs_velocity  state feedback: available in the in-process simulation only
     realisation, output, reference, period_ns: what `control_step` takes; packed: all four as one structure
     """
 
@@ -299,7 +299,7 @@ class Law:
     def step(self, state: LawState, t_ns: int, q: FloatArray, q_dot: FloatArray | None = None) -> FloatArray:
         """tau (6,) in the body frame for the sample q (6,) of time t_ns; a copy, to keep.
 
-        Raises UsageError where the law needs the velocity q_dot (6,) and there is none.
+        Raises UsageError where the law needs the velocity q_dot (6,) and it is not given.
         """
         if q_dot is None:
             if self.needs_velocity:
@@ -309,31 +309,31 @@ class Law:
         return state.tau.copy()
 
     def adopt(self, other: Law) -> None:
-        """Take over another's gains, in place: whoever steps this law steps them from now on; then `restart`.
+        """Adopt another law's gains, in place: all users of this law use them from now on; call `restart` afterwards.
 
-        Raises UsageError, with nothing changed, where the other law is of another form, or its gains are too far out for
-        finite matrices.
+        Raises UsageError, with nothing changed, where the other law has another form, or its gains are so extreme that its
+        matrices are not finite.
         """
         if other.packed.dtype != self.packed.dtype or not all(np.isfinite(part).all() for part in other.realisation):
-            raise UsageError(f"the law '{other.name}' with these gains cannot take the place of '{self.name}'")
+            raise UsageError(f"the law '{other.name}' with these gains cannot replace the running law '{self.name}'")
         self.realisation, self.output = other.realisation, other.output
         self.packed[...] = other.packed
 
     @staticmethod
     def restart(state: LawState) -> None:
-        """Let the next sample start the law as its first did; what was counted stays."""
+        """Let the next sample start the law as its first sample did; counters are kept."""
         state.fresh[0] = 1
 
     @staticmethod
     def counts(state: LawState) -> dict[str, int]:
-        """What the law has counted so far, by name."""
+        """The law's counters, by name."""
         return dict(zip(COUNTS, state.counts.tolist(), strict=True))
 
 
 def make_law(name: str, scenario: Scenario) -> Law:
     """The law called `name` for the scenario's gains and rate.
 
-    Raises UsageError for a name there is not, ScenarioError where the scenario's filter is none for that law.
+    Raises UsageError for an unknown name, ScenarioError where the law cannot use the scenario's filter.
     """
     return Law(name, scenario, make_realisation(name, scenario), needs_velocity=law_entry(name).needs_velocity)
 

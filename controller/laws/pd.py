@@ -31,7 +31,7 @@ def pd(scenario: Scenario, gains: PdGains, filters: Filters) -> Realisation:
 def with_pd_gains(
     scenario: Scenario, gains: PdGains, filters: Filters, *, feed_forward: bool, compensate: bool
 ) -> Realisation:
-    """A law with the PD gains Kp and Kd, which the common form takes multiplied by b."""
+    """A law with the PD gains Kp and Kd; the common form expects them multiplied by b."""
     import numpy as np  # here: as in `ude`
 
     from controller.laws.discretise import realise

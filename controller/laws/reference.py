@@ -2,8 +2,8 @@
 
     q_d'' = -A_d q_d' - B_d q_d - C_d c(t),   c(t) = amplitude sin(frequency t + phase)   (32), (33)
 
-per axis. Random access: a lost sample loses nothing. By its sign the model answers 180 degrees late, and with the paper's
-numbers it shrinks the command: q_d swings +-12.55 cm for 100 cm and +-.313 rad for 2.
+per axis. It can be evaluated at any time, so a lost sample does no harm. By its sign the model lags by 180 degrees, and the
+paper's numbers shrink the command: q_d swings +-12.55 cm for 100 cm and +-.313 rad for 2.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def evaluate_reference(
     """Fill q_d, q_d' and q_d'' (6,) at time t (s)."""
     swing = lead = even = odd = 0.0
     for i in range(6):
-        # Axes often share a frequency and a model: then they share their sines and exponentials too.
+        # Axes often share a frequency and a model: then their sines and exponentials are computed once.
         frequency = reference.frequency[i]
         if i == 0 or frequency != reference.frequency[i - 1]:
             swing, lead = math.sin(frequency * t), math.cos(frequency * t)

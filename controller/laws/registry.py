@@ -1,4 +1,4 @@
-"""The registry of the control laws: one row each. A law's own file is loaded when the law is made or its gains are read."""
+"""The registry of the control laws: one row each. A law's file is loaded when the law is built or its gains are read."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from protocol.scenario import Scenario, Table, unknown_key
 
 
 class LawEntry(NamedTuple):
-    """What is known of a law without loading it; places are module:name.
+    """What is known of a law without loading it; a place is module:name.
 
-    number          what logs know it by (LAW_INDEX): it never changes, and goes to no other law
-    place           the function that makes its matrices of the scenario and its gains
-    gains           its tables in the scenario's [gains], name -> struct, in the order in which the function takes them
-    needs_velocity  state feedback: it flies in `simulate` only
+    number          identifies the law in logs (LAW_INDEX): it never changes and is never reused
+    place           the function that computes its matrices from the scenario and its gains
+    gains           its tables in the scenario's [gains], name -> struct, in the order of the function's arguments
+    needs_velocity  state feedback: available in `simulate` only
     """
 
     number: int
@@ -42,11 +42,11 @@ LAWS: Mapping[str, LawEntry] = MappingProxyType(
         "uncompensated": LawEntry(5, "controller.laws.ude:uncompensated", _UDE, False, "`ude` without its estimate: G_f = 0"),
     }
 )  # fmt: skip
-"""A new law takes the next number; one that is taken out leaves its own unused."""
+"""A new law gets the next number; the number of a removed law is not reused."""
 
 
 def law_entry(name: str) -> LawEntry:
-    """What is known of the law called `name`. Raises UsageError for a name there is not."""
+    """The registry's row of the law called `name`. Raises UsageError for an unknown name."""
     if name not in LAWS:
         raise UsageError(f"there is no law '{name}': choose one of {', '.join(LAWS)}")
     return LAWS[name]
@@ -58,16 +58,16 @@ def gains_tables() -> dict[str, str]:
 
 
 def declared_gains(scenario: Scenario) -> dict[str, type[Table]]:
-    """The structs of the tables of gains that the scenario has or its law needs. Raises UsageError for a law there is not."""
+    """The structs of the gains tables that the scenario has or its law needs. Raises UsageError for an unknown law."""
     own = law_entry(scenario.law).gains
-    places = {**gains_tables(), **own}  # two laws may ask different things of a table that they share
+    places = {**gains_tables(), **own}  # two laws may have different structs for a table that they share
     return {name: load(place) for name, place in places.items() if name in own or name in scenario.gains}
 
 
 def check_law(scenario: Scenario, source: object = None) -> None:
-    """Raise UsageError where the scenario's law is none, ScenarioError where a table of gains is not as its laws declare it.
+    """Raise UsageError for an unknown law, ScenarioError where a table of gains is not as its laws declare it.
 
-    source: names the file in the sentence. Loads the files of these laws, and no more.
+    source: names the file in the error message. Loads the files of these laws only.
     """
     declared = declared_gains(scenario)
     for name in scenario.gains:
@@ -79,7 +79,7 @@ def check_law(scenario: Scenario, source: object = None) -> None:
 
 
 def refuse_on_a_link(scenario: Scenario, source: object = None) -> None:
-    """`check_law`; raises UsageError too where the law cannot fly on a link, which carries no velocities."""
+    """`check_law`; also raises UsageError where the law needs velocities, which a link does not carry."""
     check_law(scenario, source)
     if law_entry(scenario.law).needs_velocity:
         raise UsageError(velocity_sentence(scenario.law))
@@ -102,6 +102,6 @@ def make_realisation(name: str, scenario: Scenario) -> Realisation:
 
 
 def load(place: str) -> Any:
-    """What stands at a place, module:name."""
+    """The object at a place, module:name."""
     module, _, name = place.partition(":")
     return getattr(importlib.import_module(module), name)

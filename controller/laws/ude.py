@@ -37,7 +37,7 @@ def ude_state(scenario: Scenario, gains: UdeGains, filters: StateFeedbackFilters
 
 
 def uncompensated(scenario: Scenario, gains: UdeGains, filters: Filters) -> Realisation:
-    """The same gains with G_f = 0: the estimate stays what it was at the start (`uhat0`)."""
+    """The same gains with G_f = 0: the estimate keeps its initial value (`uhat0`)."""
     return _paper_law(scenario, gains, filters, compensate=False)
 
 
@@ -49,7 +49,7 @@ def _paper_law(
     compensate: bool = True,
     state_feedback: bool = False,
 ) -> Realisation:
-    import numpy as np  # here: `fwav-hil run` checks the gains before it starts anything, and need not wait for NumPy
+    import numpy as np  # here: `fwav-hil run` checks the gains before it starts anything, and does not wait for NumPy
 
     from controller.laws.discretise import realise
 

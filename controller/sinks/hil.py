@@ -1,4 +1,4 @@
-"""Commands to the emulator: HIL_ACTUATOR_CONTROLS, which echo the time of the sample that they answer, in compiled code."""
+"""Commands to the emulator, compiled: HIL_ACTUATOR_CONTROLS, which echoes the time of the sample that it answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where commands go: what every sink does, whatever it speaks."""
+"""Where commands go: the interface of every sink."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from protocol.messages import FloatArray
 
 
 class CommandSink(abc.ABC):
-    """Carries what a law asks for to the actuators, and has the law advance with what will really act of it.
+    """Sends a law's command to the actuators, and advances the law with the part of it that will really act.
 
-    A sink that limits in Python calls `Law.output`, puts its own limits on that, and gives what is left to `Law.advance`.
+    A sink that limits in Python calls `Law.output`, applies its own limits, and passes the limited command to `Law.advance`.
     """
 
     @abc.abstractmethod

@@ -1,7 +1,7 @@
 """Pose samples from the emulator: ATT_POS_MOCAP and the HIL_SENSOR that follows it, in compiled code.
 
-The only fields that reach a law are those of ATT_POS_MOCAP; of HIL_SENSOR the time is read, which makes it the tick.
-HIL_GPS, HIL_STATE_QUATERNION and ODOMETRY are not looked at.
+A law gets fields of ATT_POS_MOCAP only; of HIL_SENSOR only the time is read: it marks the tick.
+HIL_GPS, HIL_STATE_QUATERNION and ODOMETRY are ignored.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from protocol.wire.mapping import POSE, TICK, read_pose
 CAUSES = ("unknown_sender", "bad_pose", "tick_without_pose", "backwards", "bad_time")
 UNKNOWN_SENDER, BAD_POSE, TICK_WITHOUT_POSE, BACKWARDS, BAD_TIME = range(len(CAUSES))
 LATEST_US = 1 << 53
-"""Times from here on (285 years) are no times: in nanoseconds they would not fit."""
+"""Times from here on (285 years) are rejected: in nanoseconds they would overflow."""
 
 NOTHING, SAMPLE, AGAIN, OTHERS = (int(found) for found in Found)
 _POSE_ID, _TICK_ID = POSE.message_id, TICK.message_id
@@ -67,7 +67,7 @@ def receive(data: Bytes, at: int, reading: Packed, table: Table, rows: Packed, s
         elif s.pose_us != t_us:
             counters[TICK_WITHOUT_POSE] += 1
         else:
-            if s.newest_us < 0:  # the emulator's numbers restart with its first tick
+            if s.newest_us < 0:  # the emulator's sequence numbers restart with its first tick
                 r.follow = 1
                 r.next[:] = -1
                 r.next[row.system << 8 | row.component] = (row.sequence + 1) & 0xFF
@@ -77,10 +77,10 @@ def receive(data: Bytes, at: int, reading: Packed, table: Table, rows: Packed, s
 
 
 class HilSource(PoseSource):
-    """Joins the pose and the tick of one time into a sample; only the emulator at `sender` is believed.
+    """Joins the pose and the tick of one time into a sample; only frames of the emulator at `sender` are accepted.
 
-    counters   unknown_sender     frames of these messages from somebody else than the emulator
-               bad_pose           poses with NaN, or a quaternion that is not unit
+    counters   unknown_sender     frames of these messages from a sender other than the emulator
+               bad_pose           poses with NaN, or a quaternion not of unit length
                tick_without_pose  ticks whose pose was lost: no sample
                backwards          ticks older than the newest one
                bad_time           ticks whose time is out of all range
@@ -113,7 +113,7 @@ class HilSource(PoseSource):
         self._data, self._at = self._reader.whole(data), 0
 
     def read(self) -> Found:
-        """Read on, up to the next sample; see `receive`."""
+        """Continue reading, up to the next sample; see `receive`."""
         data = self._data
         found, self._at, others = receive(data, self._at, *self._arguments)
         self.is_read = self._at == len(data)
@@ -126,7 +126,7 @@ class HilSource(PoseSource):
         return _FOUND[found]
 
     def counters(self) -> dict[str, int]:
-        """What was refused, by cause."""
+        """The rejected frames, by cause."""
         return dict(zip(CAUSES, self._memory["counters"][0].tolist(), strict=True))
 
 

@@ -1,7 +1,7 @@
-"""Where pose samples come from: what every source does, whatever it speaks.
+"""Where pose samples come from: the interface of every source.
 
-A source takes what its link delivers, frame by frame in the order on the wire, and stops at each new sample, so that what
-came before it is heard before it is answered. It reads positions and attitude angles, and no velocity.
+A source reads what its link delivers, frame by frame in the order on the wire, and stops at each new sample, so that frames
+received before it are handled before it is answered. It reads positions and attitude angles, and no velocity.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ class Found(enum.IntEnum):
     NOTHING = 0
     """all that was given has been read"""
     SAMPLE = 1
-    """a new sample is there"""
+    """a new sample has arrived"""
     AGAIN = 2
-    """the newest sample came once more: its answer was lost"""
+    """the newest sample arrived again: its answer was lost"""
     OTHERS = 3
-    """frames that are not the source's are to be heard before it reads on"""
+    """other frames have to be handled before it reads on"""
 
 
 class PoseSource(abc.ABC):
@@ -32,7 +32,7 @@ class PoseSource(abc.ABC):
     t_ns      time of the newest sample; -1 before the first
     q         (6,) its position (m, north east down) and attitude (rad); the next sample overwrites it
     is_read   whether all that was fed has been read
-    others    frames met since `read` began, or since they were last taken: somebody else hears them
+    others    frames of other messages since they were last collected: the caller handles them
     """
 
     t_ns: int = -1
@@ -44,7 +44,7 @@ class PoseSource(abc.ABC):
 
     @abc.abstractmethod
     def feed(self, data: bytes) -> None:
-        """Take the next bytes of the link: a datagram, or a chunk of a stream."""
+        """Accept the next bytes of the link: a datagram, or a chunk of a stream."""
 
     @abc.abstractmethod
     def read(self) -> Found:
@@ -52,4 +52,4 @@ class PoseSource(abc.ABC):
 
     @abc.abstractmethod
     def counters(self) -> dict[str, int]:
-        """What was refused, by cause."""
+        """The rejected frames, by cause."""

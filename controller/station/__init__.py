@@ -1,1 +1,1 @@
-"""The controller towards a ground station."""
+"""The controller as a ground station sees it."""

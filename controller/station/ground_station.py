@@ -1,4 +1,4 @@
-"""The controller towards a ground station: a vehicle with parameters."""
+"""The controller as a ground station sees it: a vehicle with parameters."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from protocol.wire.schedule import Schedule
 
 
 class GroundStation:
-    """Answers a station on its own link: commands as on the loop's, parameters, and no to files.
+    """Answers a station on its own link: commands as on the loop's link, and parameters; file transfers are rejected.
 
     next_ns   simulation time at which to poll next
     """
@@ -40,7 +40,7 @@ class GroundStation:
             self.poll(t_ns)
 
     def poll(self, t_ns: int) -> None:
-        """Hear the station, at simulation time t_ns, and answer it."""
+        """Handle the station's frames, at simulation time t_ns, and answer them."""
         t_ns = max(0, t_ns)
         self._station.t_us = t_ns // 1000
         for frame in self._station.poll():
@@ -54,7 +54,7 @@ class GroundStation:
             self._station.say(*saying)
 
     def counters(self) -> dict[str, int]:
-        """What was asked for, and what the link has counted."""
+        """Counters of the requests and of the link."""
         return {**self._requests.counters, **self._station.counters()}
 
     def _say_version(self, _request: Request) -> Result:

@@ -1,1 +1,1 @@
-"""Motor drives behind a CAN bus."""
+"""Motor drives on a CAN bus."""

@@ -1,7 +1,7 @@
 """Six drives and their gears: torque limits, rate limit, current lag, hysteresis, heat. Compiled; no bus, no clock.
 
-input   target (6,)   torque asked for (N, N m), the scenario's `actuators.safe` for a drive that is not enabled
-output  u (6,)        generalised force behind the gears, its mean over the step
+input   target (6,)   commanded torque (N, N m), the scenario's `actuators.safe` for a drive that is not enabled
+output  u (6,)        generalised force after the gears, its mean over the step
 state   ramp, tau, u, d, temperature (6,) each
 
     ramp   moves to the target, held at the limits, at most rate_limit * scale in a second
@@ -9,8 +9,8 @@ state   ramp, tau, u, d, temperature (6,) each
     u, d   gear hysteresis (2), (3), the functions of the direct path (`backlash.gear_step`)
     temp   thermal_time_constant_s temp' = ambient + temperature_rise (tau / scale)^2 - temp       copper loss
 
-A step is made of sub-steps of the torque loop's period or less. With lag_s and rate_limit 0 the torque is there at once,
-and u is that of the direct path to the bit.
+A step consists of sub-steps of at most the torque loop's period. With lag_s and rate_limit 0 the torque acts at once,
+and u equals that of the direct path to the bit.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from protocol.scenario import NANOSECONDS, Scenario
 
 
 class DriveState(NamedTuple):
-    """All that moves, (6,) each, changed in place; `packed` holds the same memory."""
+    """The drives' state, (6,) each, changed in place; `packed` holds the same memory."""
 
     ramp: FloatArray
     tau: FloatArray
@@ -40,7 +40,7 @@ class DriveState(NamedTuple):
 
 @compiled
 def _step(state: Packed, parameters: Packed, target: FloatArray, steps: int, step_s: float) -> None:
-    """Move all six on by `steps` sub-steps of step_s."""
+    """Advance all six by `steps` sub-steps of step_s."""
     s, p = state[0], parameters[0]
     keep = math.exp(-step_s / p.lag_s) if p.lag_s > 0.0 else 0.0
     heat = -math.expm1(-step_s / p.thermal_time_constant_s)
@@ -67,7 +67,7 @@ def _step(state: Packed, parameters: Packed, target: FloatArray, steps: int, ste
 
 @compiled
 def _jump(state: Packed, parameters: Packed, axis: int, tau: float) -> None:
-    """Set the torque of one drive at once, its filters with it; the gear sees the move."""
+    """Set the torque of one drive, and its filters, at once; the gear sees the move."""
     s, p = state[0], parameters[0]
     s.u[axis], s.d[axis] = gear_step(p.model, s.tau[axis], tau, s.u[axis], s.d[axis], p.h[axis], p.p[axis], p.chi[axis])
     s.tau[axis] = tau
@@ -76,7 +76,7 @@ def _jump(state: Packed, parameters: Packed, axis: int, tau: float) -> None:
 
 
 class DriveBank:
-    """The six drives for callers in Python. Begins at `tau0` (6,), in action, with d = 0 and the motors at ambient."""
+    """The six drives for callers in Python. They start with `tau0` (6,) acting, d = 0 and the motors at ambient temperature."""
 
     def __init__(self, scenario: Scenario, tau0: FloatArray) -> None:
         motor, actuators = scenario.motor, scenario.actuators
@@ -109,7 +109,7 @@ class DriveBank:
         self.begin(tau0)
 
     def begin(self, tau0: FloatArray) -> None:
-        """Go back to the start, with tau0 (6,) in action."""
+        """Reset to the start, with tau0 (6,) acting."""
         state = self.state
         state.ramp[:] = state.tau[:] = tau0
         state.u[:] = state.mean_u[:] = self._h * tau0
@@ -117,7 +117,7 @@ class DriveBank:
         state.temperature[:] = self.ambient
 
     def step(self, target: FloatArray, duration_ns: int) -> FloatArray:
-        """Move on by duration_ns towards target (6,); returns the mean u (6,) over it."""
+        """Advance by duration_ns towards target (6,); returns the mean u (6,) over it."""
         steps = max(1, math.ceil(duration_ns / NANOSECONDS * self._loop_hz - 1e-9))
         _step(self.state.packed, self._parameters, target, steps, duration_ns / NANOSECONDS / steps)
         return self.state.mean_u.copy()

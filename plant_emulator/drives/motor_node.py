@@ -1,18 +1,18 @@
-"""The drives as a bus sees them: frames in, frames out, limits and watchdog kept, six nodes in one object. No I/O here.
+"""The drives as seen from the bus: frames in, frames out, limits and watchdog, six nodes in one object. No I/O here.
 
-Time. From the first SYNC on (`simulation_sync`) a node lives by the bridge's simulation time: it moves when a SYNC comes,
-answers it, and its watchdog counts SYNC time. Without SYNC, as with any other controller, it lives by its own clock.
+Time. From the first SYNC on (`simulation_sync`) a node uses the bridge's simulation time: it advances when a SYNC arrives,
+answers it, and its watchdog counts SYNC time. Without SYNC, as with any other controller, it uses its own clock.
 
-A host whose SYNC stays away is taken for gone: time is the node's own again, and the watchdog acts. In real time that is so
-after 2 s. In lockstep a silent host may be waiting, or stand still on a busy machine: wall time changes nothing. Only after
-30 s, longer than a host waits for anybody, is its run over: should it come back it is not answered, so that a run ends with an
-error rather than with drives that let go in the middle of it.
+When SYNC stops, the host counts as lost: the node uses its own clock again, and the watchdog acts. In real time this happens
+after 2 s. In lockstep a silent host may be waiting, or stalled on a busy machine, so wall time changes nothing. Only after
+30 s, longer than a host waits for any peer, is its run considered over: a host that returns later is not answered, so that
+the run ends with an error rather than with drives that were disabled in the middle of it.
 
-A drive gives its safe value (`actuators.safe`) until it is enabled, and again once a fault is latched: no command for
-`watchdog_s`, too hot, or stopped by an Estop. Torque jumps there and every filter is reset.
+A drive outputs its safe value (`actuators.safe`) until it is enabled, and again once a fault is latched: no command for
+`watchdog_s`, over-temperature, or an Estop. The torque jumps to that value and every filter is reset.
 
-The first SYNC of a run (t = 0) begins the flight where the direct path would: `initial.command` in action. A node that is
-started in the middle of one begins disabled, at its safe value (where the gears stood is lost with the process), and says
+The first SYNC of a run (t = 0) starts the flight as the direct path does: with `initial.command` acting. A node started
+in the middle of a run begins disabled, at its safe value (the gears' state is lost with the old process), and sends
 HELLO before its first answers.
 """
 
@@ -32,23 +32,23 @@ from protocol.scenario import NANOSECONDS, Scenario
 
 HOST_GONE_NS = 2 * NANOSECONDS
 RUN_OVER_NS = 30 * NANOSECONDS
-"""In lockstep: of wall time without a SYNC."""
+"""In lockstep: wall time without a SYNC after which a run is over."""
 OWN_STEP_NS = NANOSECONDS // 1000
-"""In its own time a node moves on at least this often, if it is given the chance."""
+"""On its own clock a node advances at least this often, if the caller polls it."""
 LONGEST_STEP_NS = NANOSECONDS // 10
-"""A process that was held up makes up for this much at most."""
+"""A process that was stalled catches up at most this much."""
 
 
 class MotorNode:
     """Six drives of one protocol.
 
-    counters   taken              frames with an order for one of the drives
+    counters   taken              frames with a command for one of the drives
                syncs, repeated_syncs, backward_syncs, waiting_syncs
-                                  SYNC frames answered; that came again (answered alike, nothing moves); from the past; that
-                                  came before all the commands they name (not answered)
+                                  SYNC frames answered; repeated (same answer, nothing moves); from the past; received
+                                  before all the commands that they name (not answered)
                watchdog_trips, over_temperatures, estops
                                   faults latched, drive by drive
-               lost_hosts         times the SYNC stayed away for too long
+               lost_hosts         times the SYNC was missing for too long
                refused_syncs      SYNC frames of a host in lockstep whose run is over
                and one for each cause of `motor_protocol.Cause`
     """
@@ -85,11 +85,11 @@ class MotorNode:
 
     @property
     def in_lockstep(self) -> bool:
-        """Whether time is the SYNC's."""
+        """Whether time is that of the SYNC."""
         return self._sync_ns is not None
 
     def elapse(self, now_ns: int) -> list[CanFrame]:
-        """Let wall time pass: now_ns from any start. Returns the cyclic messages due, where time is the node's own."""
+        """Advance to wall time now_ns (any epoch). Returns the cyclic messages due, if the node uses its own clock."""
         if self.in_lockstep:
             if now_ns - self._heard_ns < (RUN_OVER_NS if self._host_waits else HOST_GONE_NS):
                 return []
@@ -104,7 +104,7 @@ class MotorNode:
         return self._cyclic()
 
     def receive(self, frame: CanFrame, now_ns: int) -> list[CanFrame]:
-        """What the drives say to a frame that came at wall time now_ns."""
+        """The drives' answers to a frame received at wall time now_ns."""
         if simulation_sync.is_simulation_only(frame):
             return self._simulation_frame(frame, now_ns)
         taken = self._drive.decode(frame)
@@ -119,7 +119,7 @@ class MotorNode:
         return frames
 
     def readings(self) -> list[Reading]:
-        """The six drives as they show themselves now."""
+        """The present readings of the six drives."""
         if self._readings is None:
             state = self.bank.state
             motor_side = self._angles(state.tau).tolist()
@@ -167,7 +167,7 @@ class MotorNode:
         return self._sync(sync.t_ns, begins=begins)
 
     def _sync(self, t_ns: int, *, begins: bool) -> list[CanFrame]:
-        """Move to the time of a new SYNC and on over the period it begins; answer it."""
+        """Advance to the time of a new SYNC and over the period that it begins; answer it."""
         period_ns = self.scenario.period_ns
         joins = self._sync_ns is None and not begins
         if begins:
@@ -196,7 +196,7 @@ class MotorNode:
     def _use_own_time(self, now_ns: int) -> None:
         self._sync_ns = None
         self._heard_ns = now_ns - OWN_STEP_NS
-        # The host fell silent, so the last commands are as old as that.
+        # The host fell silent: let the watchdog see the last commands as expired.
         self._commanded_ns = [self._t_ns - self._watchdog_ns] * DRIVES
         self._restart_schedule()
 
@@ -211,7 +211,7 @@ class MotorNode:
             self._commanded_ns[axis] = self._t_ns
             if self._enabled[axis]:
                 self._target[axis] = order.torque * self._scale[axis]
-            return  # a reading shows it from the next step on
+            return  # readings show it from the next step on
         if order.action is Action.ENABLE and not self._faults[axis]:
             if not self._enabled[axis]:
                 self._enabled[axis] = True
@@ -225,7 +225,7 @@ class MotorNode:
         self._readings = None
 
     def _move(self, t_ns: int, duration_ns: int) -> None:
-        """Let the drives run for duration_ns; t_ns is the time that the watchdog counts."""
+        """Run the drives for duration_ns; t_ns is the watchdog's time."""
         self._t_ns = t_ns
         for axis in range(DRIVES):
             if self._enabled[axis] and t_ns - self._commanded_ns[axis] > self._watchdog_ns:
@@ -263,14 +263,14 @@ class MotorNode:
         return frames
 
     def _angles(self, force: np.typing.NDArray[np.float64]) -> np.typing.NDArray[np.float64]:
-        """Shaft angles (6,), in whole counts of the encoder, that stand for a torque or force (6,)."""
+        """Shaft angles (6,), in whole counts of the encoder, that represent a torque or force (6,)."""
         motor = self.scenario.motor
         count = 2.0 * math.pi / motor.encoder_counts
         return np.asarray(np.round(force / self._scale * motor.travel_rad / count) * count)
 
 
 def is_of_drives(frame: CanFrame) -> bool:
-    """Whether only drives of another node process say this on a bus: their answers, their hello, their encoders."""
+    """Whether this frame can only come from drives of another process: an answer, a hello or an encoder frame."""
     return (
         simulation_sync.decode_answer(frame) is not None
         or simulation_sync.decode_hello(frame, drives=True) is not None
@@ -279,7 +279,7 @@ def is_of_drives(frame: CanFrame) -> bool:
 
 
 def warm_up(scenario: Scenario, protocol: str) -> Sequence[CanFrame]:
-    """Have every kernel of a node compiled (or loaded)."""
+    """Compile every kernel of a node (or load it from the cache)."""
     node = MotorNode(scenario, protocol)
     node.bank.jump(0, 0.0)
     return node.receive(simulation_sync.encode_sync(0, 0), 0)

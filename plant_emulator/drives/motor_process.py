@@ -1,4 +1,4 @@
-"""The drives as a process, or as a thread beside an emulator where the bus cannot leave the process."""
+"""The drives as a process, or as a thread of the emulator where the bus exists only within one process."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from protocol.scenario import NANOSECONDS, Scenario
 
 RESULT = "motor.json"
 LISTEN_S = 0.25
-"""Time in which drives that are on the bus already are noticed: they show their encoders far more often."""
+"""How long to listen for drives already on the bus: they send encoder frames far more often."""
 LOCKSTEP_WAIT_S = 0.1
 OWN_WAIT_S = 0.001
 
 
 def run_motor(scenario: Scenario, options: MotorOptions, report: Report, stop: StopFlag) -> dict[str, Any]:
-    """Be the six drives on a bus until asked to stop; returns what was counted. Raises the errors of `protocol.errors`."""
+    """Run the six drives on a bus until asked to stop; returns the counters. Raises the errors of `protocol.errors`."""
     if options.out:
         take_folder(options.out, RESULT)
     warm_up(scenario, scenario.motor.protocol)
@@ -54,7 +54,7 @@ def run_motor(scenario: Scenario, options: MotorOptions, report: Report, stop: S
 
 
 def serve_once(node: MotorNode, bus: CanBus, clock: Clock) -> None:
-    """Take the next frame, if one comes soon, and let time pass."""
+    """Handle the next frame, if one arrives soon, and advance time."""
     frame = bus.recv(LOCKSTEP_WAIT_S if node.in_lockstep else OWN_WAIT_S)
     now_ns = clock.now_ns()
     if frame is not None:
@@ -65,13 +65,13 @@ def serve_once(node: MotorNode, bus: CanBus, clock: Clock) -> None:
 
 
 def _refuse_other_drives(bus: CanBus, clock: Clock) -> None:
-    """Raise LinkInUseError where other drives speak on the bus already."""
+    """Raise LinkInUseError where other drives already send on the bus."""
     until_ns = clock.now_ns() + round(LISTEN_S * NANOSECONDS)
     while (remaining_ns := until_ns - clock.now_ns()) > 0:
         frame = bus.recv(remaining_ns * 1e-9)
         if frame is not None and is_of_drives(frame):
             raise LinkInUseError(
-                f"there are drives on the CAN bus {bus.uri.text} already ({frame}): end those, or choose another bus with --can"
+                f"the CAN bus {bus.uri.text} already has drives ({frame}): stop those, or choose another bus with --can"
             )
 
 
@@ -91,7 +91,7 @@ class MotorThread:
             try:
                 serve_once(self.node, self._bus, clock)
             except FwavHilError:
-                return  # the emulator notices that nobody answers
+                return  # the emulator notices that its drives do not answer
 
     def __enter__(self) -> MotorThread:
         self._thread.start()

@@ -1,4 +1,4 @@
-"""What a run with `--motor can` opens before its first tick, and closes at its end."""
+"""What a run with `--motor can` opens before its first tick and closes at its end."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def open_motors(
     stop: StopFlag,
     tell: Callable[[str], None] | None = None,
 ) -> Iterator[CanMotors]:
-    """The drives of a run, met. On a `virtual:` bus they live in a thread of this process. `tell`: see `CanRecorder`.
+    """The connected drives of a run. On a `virtual:` bus they are a thread of this process. `tell`: see `CanRecorder`.
 
     Raises the errors of `CanBus`, `plan_bus`, `CanMotors.meet`.
     """
-    exact_bits(CanFrame(0))  # its kernel is compiled, or loaded, before the first tick
+    exact_bits(CanFrame(0))  # compiles or loads its kernel before the first tick
     plan = plan_bus(scenario.motor.protocol, scenario.motor, scenario.rate_hz)
     wall = MonotonicClock()
     with contextlib.ExitStack() as stack:

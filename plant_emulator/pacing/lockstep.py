@@ -1,4 +1,4 @@
-"""Lockstep: simulation time stands still until the answer to the tick is there. The `exact` profile, for our own pair."""
+"""Lockstep: simulation time stands still until the tick is answered. The `exact` profile, for our own controller."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from protocol.wire.codec import lone_frame
 from protocol.wire.mapping import COMMAND
 
 RESEND_AFTER_S = (0.010, 0.020, 0.040, 0.080, 0.160, 0.320, 0.640, 0.730)
-"""Waits of the exact profile: after each the tick is sent again; after the last, 2 s in all, the run ends."""
+"""Timeouts of the exact profile: after each the tick is sent again; after the last, 2 s in all, the run ends."""
 
 
 class Lockstep(Pacing):
-    """No answer: the same bytes again after 10, 20, 40 ms ..., and after 2 s a named error.
+    """Without an answer the same bytes are sent again after 10, 20, 40 ms ...; after 2 s the run ends with an error.
 
-    It never steps on without an answer, so stalls of the machine change nothing in the result. Every stamp in the log is
+    It never steps without an answer, so stalls of the machine do not change the result. Every time stamp in the log is
     simulation time. With a `keeper` (`--speed`) a tick waits for its time.
 
-    counters   resent   ticks sent again              foreign  frames that belong to no answer: strays, late copies
-               late, slipped    of the schedule, where `--speed` gives one (`RateKeeper`)
+    counters   resent   ticks sent again              foreign  frames that belong to no answer, such as late copies
+               late, slipped    of the schedule, with `--speed` (`RateKeeper`)
     """
 
     def __init__(self, parts: Parts, *, delay_ns: int, keeper: RateKeeper | None) -> None:
@@ -30,11 +30,11 @@ class Lockstep(Pacing):
         self.sends_ahead = keeper is None
         self._strays = 0
         self.counters = {"resent": 0, "foreign": 0}
-        if self.emulator.motors:  # a tick sent again keeps the controller waiting while we wait for the drives
+        if self.emulator.motors:  # sending the tick again keeps the controller waiting while the drives are awaited
             self.emulator.motors.on_long_wait.append(lambda: self.endpoint.link.send(self.datagram))
 
     def begin(self, t_ns: int) -> None:
-        """Wait for the tick's time, where there is a speed to keep."""
+        """Wait for the tick's time, with `--speed`."""
         if self.keeper:
             if t_ns == 0:
                 self.keeper.start()
@@ -56,12 +56,12 @@ class Lockstep(Pacing):
             if self.await_answer(t_ns, round(wait_s * 1e9)):
                 return
         raise PeerLostError(
-            f"the controller at {self.endpoint.link.peer} gave no answer to the tick at t = {t_ns * 1e-9:.3f} s for 2 s: "
-            "see whether it still runs"
+            f"the controller at {self.endpoint.link.peer} did not answer the tick at t = {t_ns * 1e-9:.3f} s within 2 s: "
+            "check that it still runs"
         )
 
     def await_answer(self, t_ns: int, wait_ns: int) -> bool:
-        """Whether the answer to the tick came in time, and acts now."""
+        """Whether the answer to the tick arrived in time, and acts now."""
         source, clock = self.emulator.source, self.clock
         deadline_ns = clock.now_ns() + wait_ns
         timeout_s = wait_ns * 1e-9
@@ -79,10 +79,10 @@ class Lockstep(Pacing):
             remaining_ns = deadline_ns - came_ns
             if (timeout_s == 0.0 and not data) or remaining_ns < -wait_ns:
                 return False
-            timeout_s = max(0.0, remaining_ns * 1e-9)  # at 0 one last look: the machine may have stalled
+            timeout_s = max(0.0, remaining_ns * 1e-9)  # at 0 receive once more: the machine may have stalled
 
     def command_came(self, t_ns: int) -> None:
-        """Let the answer act, a delay of simulation time later."""
+        """Let the answer act after the delay, in simulation time."""
         self.emulator.act(t_ns, self.delay_ns)
 
     def forget_received(self) -> None:
@@ -92,22 +92,22 @@ class Lockstep(Pacing):
         raws.clear()
 
     def log_received(self, t_ns: int) -> None:
-        """Log the frames of an answer, each once. Numbers restart at t = 0, so the first answer's own tells which are its."""
+        """Log the frames of an answer, each once. Sequence numbers restart at t = 0: so the first answer's are known."""
         source = self.emulator.source
         raws, source.raws = source.raws, []
         if len(raws) > 1 or t_ns == 0:
             received = len(raws)
             if t_ns == 0:
                 raws = _without_strays(raws)
-            raws = list(dict.fromkeys(raws))  # of a damaged answer and its copy some came twice
+            raws = list(dict.fromkeys(raws))  # after a damaged answer and its copy some frames are there twice
             self.counters["foreign"] += received - len(raws)
         self.owe_log(t_ns // 1000, raws)
 
 
 def _without_strays(raws: list[bytes]) -> list[bytes]:
-    """The frames received until the first answer was there, without those that the controller said before it.
+    """The frames received up to the first answer, without those that the controller sent before it.
 
-    The command's own number tells how many frames of its sender belong to the answer.
+    The command's sequence number tells how many frames of its sender belong to the answer.
     """
     frames = [lone_frame(raw) for raw in raws]
     theirs = [number for number, frame in enumerate(frames) if (frame.system, frame.component) == VEHICLE]

@@ -1,4 +1,4 @@
-"""Before the first tick: the plant is held where it starts until a controller, or an autopilot, is there."""
+"""Before the first tick: the plant is held at its initial state until a controller, or an autopilot, has connected."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HELLO_PERIOD_S = 0.1
 def meet_controller(
     scenario: Scenario, wait_s: float, endpoint: Endpoint, stop: StopFlag, emulator: Emulator | None = None
 ) -> None:
-    """Hold the plant at t = 0 until a controller with the same scenario says it is armed. Raises PeerError, Interrupted."""
+    """Hold the plant at t = 0 until a controller with the same scenario reports armed. Raises PeerError, Interrupted."""
     digest = scenario.digest()
     agreed = heard = False
     clock = MonotonicClock()
@@ -52,7 +52,7 @@ def meet_controller(
                 and agreed
                 and mapping.heartbeat_is_armed(frame.payload)
             ):
-                endpoint.writer.sequence = 0  # the numbers of the run, and so its log, begin with the first tick
+                endpoint.writer.sequence = 0  # the run's sequence numbers, and so its log, begin with the first tick
                 return
     uri = endpoint.link.uri
     if heard:
@@ -60,15 +60,15 @@ def meet_controller(
             f"the controller at {endpoint.link.peer} did not arm within {wait_s:g} s: start it with --arm"
         )
     raise PeerMissingError(
-        f"no controller came to {uri} within {wait_s:g} s: start one with `fwav-hil controller "
+        f"no controller connected to {uri} within {wait_s:g} s: start one with `fwav-hil controller "
         f"SCENARIO --link {counterpart(uri)}`, or wait longer with --wait"
     )
 
 
 def meet_autopilot(wait_s: float, endpoint: Endpoint, stop: StopFlag, emulator: Emulator) -> None:
-    """Say hello until an autopilot (1/1) says anything. Raises PeerMissingError, Interrupted.
+    """Send heartbeats until an autopilot (1/1) sends anything. Raises PeerMissingError, Interrupted.
 
-    PX4 over TCP speaks when it is accepted; over UDP it waits to be spoken to.
+    PX4 over TCP sends once its connection is accepted; over UDP it waits for a first frame.
     """
     clock = MonotonicClock()
     give_up_ns = clock.now_ns() + round(wait_s * NANOSECONDS)
@@ -83,6 +83,6 @@ def meet_autopilot(wait_s: float, endpoint: Endpoint, stop: StopFlag, emulator: 
             endpoint.writer.sequence = 0
             return
     raise PeerMissingError(
-        f"no autopilot came to {endpoint.link.uri} within {wait_s:g} s: start one that looks for its simulator there (PX4: "
+        f"no autopilot connected to {endpoint.link.uri} within {wait_s:g} s: start one that connects to it (PX4: "
         "a TCP client of port 4560, so --link tcpin://127.0.0.1:4560), or wait longer with --wait"
     )

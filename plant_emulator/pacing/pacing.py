@@ -1,4 +1,4 @@
-"""What every way of keeping time between the emulator and its peer does: carry one tick across the link, keep its books."""
+"""What all ways of keeping time have in common: exchange one tick over the link, log it and count."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _COMMAND = Found.COMMAND
 
 
 class Parts(NamedTuple):
-    """What a pacing brings together, whichever it is; period_ns: from tick to tick, ticks: how many there are."""
+    """What every pacing needs; period_ns: from tick to tick, ticks: how many there are."""
 
     emulator: Emulator
     endpoint: Endpoint
@@ -31,10 +31,10 @@ class Parts(NamedTuple):
 
 
 class Pacing(abc.ABC):
-    """Carries ticks across the link.
+    """Exchanges ticks over the link.
 
     counters        of the pacing, by name
-    keeper          of its schedule, where it has one
+    keeper          of its schedule, if it has one
     latencies_ns    for each command, wall time from the sending of its sample to the command's arrival
     """
 
@@ -46,16 +46,16 @@ class Pacing(abc.ABC):
         self.counters: dict[str, int] = {}
         self._owed: list[tuple[int, Sequence[bytes]]] = []
         self.sent_ns = 0
-        """When the tick sent last was handed to the link, on the clock."""
+        """When the last tick was handed to the link, on the clock."""
         self.datagram = b""
-        """That tick, as it was sent."""
+        """The last tick, as it was sent."""
         self._is_sent = False
 
     def exchange(self, t_ns: int) -> None:
-        """Send the tick at simulation time t_ns, let what comes of it act, and move the plant on to the next tick.
+        """Send the tick at simulation time t_ns, let the answer act, and advance the plant to the next tick.
 
         Raises PeerLostError where the controller fell silent, Interrupted where the user asked to stop, DivergenceError
-        where the plant cannot go on; the tick's row is then recorded.
+        where the plant diverged; the tick's row is then recorded.
         """
         if self.stop.requested:
             self.stop.check()
@@ -79,22 +79,22 @@ class Pacing(abc.ABC):
         self.emulator.record(t_ns)
 
     sends_ahead = True
-    """Whether a tick leaves as soon as the plant has reached it, before the books of the one before it are kept."""
+    """Whether a tick is sent as soon as the plant has reached it, before the previous one is recorded."""
 
     def begin(self, t_ns: int) -> None:  # noqa: B027  (most have nothing to wait for)
-        """Wait until the tick at t_ns is to be sent."""
+        """Wait until the tick at t_ns is due."""
 
     @abc.abstractmethod
     def take_commands(self, t_ns: int) -> None:
-        """Receive what comes upon the tick at t_ns, and let its commands act."""
+        """Receive the answers to the tick at t_ns, and let their commands act."""
 
     @abc.abstractmethod
     def stamp_us(self, t_ns: int) -> int:
-        """The time (us) under which what belongs to the tick at t_ns, now sent, is logged."""
+        """The log's time stamp (us) of the tick at t_ns, which has just been sent."""
 
     @abc.abstractmethod
     def command_came(self, t_ns: int) -> None:
-        """React to the newest command, read during the tick at t_ns: let it act."""
+        """Let the newest command, read during the tick at t_ns, act."""
 
     def send(self, t_ns: int) -> None:
         """Measure the plant at t_ns and send the tick."""
@@ -107,7 +107,7 @@ class Pacing(abc.ABC):
         self.owe_log(self.stamp_us(t_ns), self.emulator.frames())
 
     def process(self, data: bytes, t_ns: int) -> None:
-        """Take all that came during the tick at t_ns, in its order: commands act, the rest is heard."""
+        """Process the bytes received during the tick at t_ns, in order: commands act, other frames are handled."""
         source = self.emulator.source
         source.feed(data)
         while True:
@@ -128,23 +128,23 @@ class Pacing(abc.ABC):
         self.emulator.hear(frames)
 
     def move(self, t_ns: int) -> None:
-        """Note the row of the tick at t_ns and move the plant on."""
+        """Fill the row of the tick at t_ns and advance the plant."""
         self.emulator.advance(t_ns + self.period_ns)
 
     def all_counters(self) -> dict[str, int]:
-        """Everything counted, by name, that of the schedule too."""
+        """All counters, by name, with those of the schedule."""
         return {**self.counters, **(self.keeper.counters if self.keeper else {})}
 
     def owe_log(self, t_us: int, frames: Sequence[bytes]) -> None:
-        """Have frames logged under one time, when the books are next settled."""
+        """Queue frames for the log, with one time stamp; `settle_books` writes them."""
         self._owed.append((t_us, frames))
 
     def settle_books(self, _t_ns: int) -> None:
-        """See to what can wait until the tick is on its way."""
+        """Do what can wait until the tick has been sent."""
         self.settle_log()
 
     def settle_log(self) -> None:
-        """Write what is owed to the log: done while the other end is at work, and at the end of the run."""
+        """Write the queued frames to the log: done while the other end computes, and at the end of the run."""
         if self.log:
             write = self.log.write
             for t_us, frames in self._owed:
@@ -154,7 +154,7 @@ class Pacing(abc.ABC):
         self._owed.clear()
 
     def flush(self) -> None:
-        """Hand what is logged so far to the system."""
+        """Flush the log to the operating system."""
         self.settle_log()
         if self.log:
             self.log.flush()

@@ -1,10 +1,10 @@
-"""The `tolerant` profile of lockstep: for a foreign autopilot, which answers in its own time, and for links that lose things.
+"""The `tolerant` profile of lockstep: for other autopilots, which do not answer every tick, and for links that lose frames.
 
-What it expects is what PX4's simulator link was seen to do: on connecting a request for ground truth and one heartbeat, then
-nothing for some dozens of ticks, then an answer to each tick at 250 Hz, and to one tick in two or four above that. So ticks go
-out freely, a period of wall time apart, until the first answer. From then on each is waited for, at most 10 ms of wall time;
-then the tick is sent once more, and simulation time steps on with the command that stands. Late answers act when they come.
-Results depend on the machine's timing: for a result that is the same each time, the `exact` profile is there.
+It is made for the observed behaviour of PX4's simulator link: on connecting a request for ground truth and one heartbeat,
+then nothing for some dozens of ticks, then an answer to each tick at 250 Hz, and to one tick in two or four above that. Until
+the first answer ticks are sent a period of wall time apart. From then on each answer is awaited for at most 10 ms of wall
+time; then the tick is sent once more, and simulation time advances with the last command. Late answers act on arrival.
+Results depend on the machine's timing; use the `exact` profile for reproducible results.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from protocol.scenario import NANOSECONDS
 from protocol.wire.streams import HEARTBEAT_TIMEOUT_NS
 
 WAIT_NS = 10_000_000
-"""The longest wait for the answer to a tick, in wall time, once there was one."""
+"""The longest wait for the answer to a tick, in wall time, after the first answer."""
 
 
 class Tolerant(Lockstep):
-    """Simulation time waits for an answer, but not for ever.
+    """Simulation time waits for an answer, up to a timeout.
 
-    The plant is held where it starts until the first armed command: an autopilot needs its sensors at rest before it arms.
+    The plant is held at its initial state until the first armed command: an autopilot needs sensors at rest before it arms.
 
-    counters   those of `Lockstep`, where resent counts ticks sent once more, and
+    counters   those of `Lockstep` (resent: ticks sent once more), and
                unanswered     ticks without an answer in time     late_answers   answers to an earlier tick, which act now
                held           ticks with the plant held
     """
@@ -38,7 +38,7 @@ class Tolerant(Lockstep):
         self.counters |= {"unanswered": 0, "late_answers": 0, "held": 0}
 
     def take_commands(self, t_ns: int) -> None:
-        """Wait a little for an answer to the tick. Raises PeerLostError after a long silence."""
+        """Wait briefly for an answer to the tick. Raises PeerLostError after a long silence."""
         source = self.emulator.source
         source.expect(0, t_ns)
         replied = source.newest_ns >= 0
@@ -53,11 +53,11 @@ class Tolerant(Lockstep):
         if self._silence_ns > (HEARTBEAT_TIMEOUT_NS if replied else self._patience_ns):
             raise PeerLostError(
                 f"the autopilot at {self.endpoint.link.peer} has sent no HIL_ACTUATOR_CONTROLS for "
-                f"{self._silence_ns / NANOSECONDS:.3g} s of waiting, up to t = {t_ns * 1e-9:.3f} s: see whether it still runs"
+                f"{self._silence_ns / NANOSECONDS:.3g} s of waiting, up to t = {t_ns * 1e-9:.3f} s: check that it still runs"
             )
 
     def command_came(self, t_ns: int) -> None:
-        """Let an answer act now, be it one to an earlier tick."""
+        """Let an answer act now, even if it answers an earlier tick."""
         source = self.emulator.source
         self._silence_ns = 0
         self.counters["late_answers"] += source.newest_ns < t_ns
@@ -67,13 +67,13 @@ class Tolerant(Lockstep):
             self.emulator.settle()
 
     def log_received(self, t_ns: int) -> None:
-        """Log all that came; a foreign autopilot numbers its frames as it likes."""
+        """Log all frames received; another autopilot's sequence numbers follow no rule of ours."""
         source = self.emulator.source
         raws, source.raws = source.raws, []
         self.owe_log(t_ns // 1000, raws)
 
     def move(self, t_ns: int) -> None:
-        """Move the plant on, or hold it."""
+        """Advance the plant, or hold it."""
         end_ns = t_ns + self.period_ns
         if self._flies:
             self.emulator.check_staleness(end_ns, self.delay_ns)

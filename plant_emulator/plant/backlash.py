@@ -13,7 +13,7 @@ from protocol.scenario import Backlash, Play
 BACKLASH = 0
 PLAY = 1
 ELSEWHERE = 2
-"""No gear here: what comes in is the force behind one (drives on a CAN bus have their own)."""
+"""No gear here: the input is already the force after a gear (drives on a CAN bus contain the gears)."""
 
 
 @compiled
@@ -61,7 +61,7 @@ class GearHysteresis:
         play       u follows h (tau - B) upward, h (tau + B) downward   (2)
 
     Just after a reversal from saturated d the backlash has the slope 2 kappa - h: where that is negative (as with the
-    paper's numbers), u first moves the wrong way. There is no dynamics here: no inertia of the gear, no friction torque.
+    paper's numbers), u first moves the wrong way. Dynamics are not modelled: no inertia of the gear, no friction torque.
     """
 
     def __init__(self, model: Backlash | Play, tau0: FloatArray) -> None:

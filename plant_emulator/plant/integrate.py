@@ -1,7 +1,7 @@
-"""The plant in time: commands act when they arrive, gears move at once, the body is integrated by Runge-Kutta 4.
+"""The plant over time: commands act when they arrive, gears move at once, the body is integrated by Runge-Kutta 4.
 
-Every kernel works in place on a `PlantState`; `Plant` is the same for callers in Python. A command that arrives within a
-step of the integrator splits that step in two, so the moment of its action is exact.
+Every kernel works in place on a `PlantState`; `Plant` is their interface for Python. A command that arrives within a
+step of the integrator splits that step in two, so the time at which it acts is exact.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from protocol.rotations import PITCH_LIMIT_RAD
 from protocol.scenario import NANOSECONDS, Scenario
 
 PENDING = 4096
-"""Most commands that can be on their way to the motors at once: 2 s at 2 kHz."""
+"""Most commands that can be pending (delayed, not yet acting) at once: 2 s at 2 kHz."""
 
 GOES_ON = 0
 NOT_FINITE = 1
@@ -44,16 +44,16 @@ class ActuatorParameters(NamedTuple):
 
 
 class PlantState(NamedTuple):
-    """All that moves, changed in place by the kernels.
+    """The plant's state, changed in place by the kernels.
 
     motion        (12,)       q and q' (m, rad, m/s, rad/s)
     tau           (6,)        motor command in action (N, N m)
-    u             (6,)        what leaves the actuators, after the gears
-    wrench        (6,)        generalised body force that u makes: allocation u
+    u             (6,)        output of the actuators, after the gears
+    wrench        (6,)        generalised body force of u: allocation u
     d             (6,)        hysteresis state u - h tau
-    pending_ns    (PENDING,)  when each command on its way begins to act
+    pending_ns    (PENDING,)  when each pending command begins to act
     pending_tau   (PENDING, 6)
-    queue         (2,)        index of the first pending command, and how many there are
+    queue         (2,)        index of the first pending command, and their number
     packed                    all of the above as one structure (the arrays share its memory), for calls from Python
     """
 
@@ -89,7 +89,7 @@ def initial_state(scenario: Scenario) -> PlantState:
 
 @compiled
 def push_command(state: PlantState, t_ns: int, tau: FloatArray) -> bool:
-    """Let tau act from t_ns on; times must not decrease. False where too many commands are on their way."""
+    """Let tau act from t_ns on; times must not decrease. False where too many commands are pending."""
     first, count = state.queue[0], state.queue[1]
     if count == PENDING:
         return False
@@ -112,7 +112,7 @@ def allocate(allocation: FloatArray, u: FloatArray, wrench: FloatArray) -> None:
 
 @compiled
 def apply_due_commands(state: PlantState, gears: ActuatorParameters, t_ns: int) -> None:
-    """Move the motors by every command whose time has come, one after the other: the gears see each reversal."""
+    """Apply every command that is due, one after the other, so that the gears see each reversal."""
     if state.queue[1] == 0 or state.pending_ns[state.queue[0]] > t_ns:
         return
     while state.queue[1] > 0 and state.pending_ns[state.queue[0]] <= t_ns:
@@ -130,7 +130,7 @@ def apply_due_commands(state: PlantState, gears: ActuatorParameters, t_ns: int) 
 
 @compiled
 def specific_wrench(t: float, wrench: FloatArray, body: BodyParameters) -> Specific:
-    """What acts on the body at time t (s), actuators plus disturbance, over its inertia."""
+    """The wrench on the body at time t (s), actuators plus disturbance, divided by its inertia."""
     s, d = body.specific, body.disturbance
     swing = 0.0
     if body.disturbance_frequency != 0.0:
@@ -157,8 +157,8 @@ def specific_force(t: float, wrench: FloatArray, body: BodyParameters, force: Fl
 def runge_kutta_step(motion: FloatArray, wrench: FloatArray, t: float, step: float, body: BodyParameters) -> None:
     """One classical Runge-Kutta step of fourth order on motion (12,), in place; the wrench (6,) is constant over it.
 
-    Written out in scalars, since that lets the compiler keep all of it in registers. Accelerations do not depend on
-    position and velocity, so the stages of the translation fold into one sum each.
+    Written in scalars so that the compiler keeps all of it in registers. Accelerations do not depend on
+    position and velocity, so the stages of the translation reduce to one sum each.
     """
     half, sixth = 0.5 * step, step / 6.0
     a, b, c = motion[3], motion[4], motion[5]
@@ -217,7 +217,7 @@ def advance(
 
 @compiled
 def fill_row(state: PlantState, command: FloatArray, row: FloatArray) -> None:
-    """Fill a row (31,) of the ground truth, but its first number: q, q', newest command, tau, u."""
+    """Fill a row (31,) of the ground truth, except its first number: q, q', newest command, tau, u."""
     for i in range(12):
         row[1 + i] = state.motion[i]
     for i in range(6):
@@ -230,18 +230,18 @@ def fill_row(state: PlantState, command: FloatArray, row: FloatArray) -> None:
 def record_and_advance(
     state: PlantState, parameters: Any, t_ns: int, end_ns: int, command: FloatArray, row: FloatArray
 ) -> int:
-    """Let what is due act at t_ns, fill the row (31,) of that moment, then `advance`; returns its outcome."""
+    """Apply the commands due at t_ns, fill the row (31,) of that time, then `advance`; returns its outcome."""
     apply_due_commands(state, parameters, t_ns)
     fill_row(state, command, row)
     return advance(state, parameters, parameters, t_ns, end_ns, parameters.substep_ns)
 
 
 class Plant:
-    """The plant for callers in Python: `command` what the motors shall do and when, `advance` the time.
+    """The plant for callers in Python: `command` sets the motors' target and its time, `advance` moves time on.
 
     State: see `PlantState`. Time starts at 0 ns. Nothing here reads a clock or draws a random number.
 
-    gears_elsewhere   commands are forces behind the gears, which stand outside this plant
+    gears_elsewhere   commands are forces after the gears, which are modelled outside this plant
     """
 
     def __init__(self, scenario: Scenario, *, gears_elsewhere: bool = False) -> None:
@@ -256,16 +256,16 @@ class Plant:
         self.t_ns = 0
 
     def command(self, t_ns: int, tau: FloatArray) -> None:
-        """Let tau (6,) act from t_ns on; times must not decrease. Raises DivergenceError where too many are on their way."""
+        """Let tau (6,) act from t_ns on; times must not decrease. Raises DivergenceError where too many are pending."""
         if not push_command(self.state.packed[0], t_ns, tau):
             self.refuse_more()
 
     def refuse_more(self) -> None:
-        """Raise DivergenceError since too many commands are on their way."""
+        """Raise DivergenceError: too many commands are pending."""
         raise DivergenceError(divergence_sentence(TOO_MANY_PENDING, self.t_ns))
 
     def apply_due_commands(self) -> None:
-        """Let the commands act whose time is now, without moving on."""
+        """Apply the commands that are due, without advancing time."""
         apply_due_commands(self.state.packed[0], self.parameters[0], self.t_ns)
 
     def advance(self, end_ns: int) -> None:
@@ -274,25 +274,25 @@ class Plant:
         self.arrive(end_ns, advance(self.state.packed[0], parameters, parameters, self.t_ns, end_ns, self.substep_ns))
 
     def specific_force(self) -> FloatArray:
-        """What an accelerometer reads now (3,), m/s^2: a - g in the body frame."""
+        """The reading (3,) of an accelerometer now, m/s^2: a - g in the body frame."""
         force = np.empty(3)
         specific_force(self.t_ns * 1e-9, self.state.wrench, self.parameters[0], force)
         return force
 
     def arrive(self, end_ns: int, outcome: int) -> None:
-        """Take note that a kernel has moved the state to end_ns. Raises DivergenceError where its outcome says so."""
+        """Record that a kernel has advanced the state to end_ns. Raises DivergenceError for an outcome other than GOES_ON."""
         if outcome != GOES_ON:
             raise DivergenceError(divergence_sentence(outcome, end_ns))
         self.t_ns = end_ns
 
 
 def divergence_sentence(outcome: int, t_ns: int) -> str:
-    """What to tell a user of a run that diverged before t_ns, or cannot go on at t_ns."""
+    """The error message of a run that diverged before t_ns, or cannot continue at t_ns."""
     if outcome == TOO_MANY_PENDING:
-        return f"more than {PENDING} commands are on their way to the motors: lower the rate or the delay"
+        return f"more than {PENDING} delayed commands are pending: lower the rate or the delay"
     reason = {
         NOT_FINITE: "the state is no longer finite",
-        PITCH_LIMIT: f"the pitch angle passed {PITCH_LIMIT_RAD} rad, where the equations of motion end",
+        PITCH_LIMIT: f"the pitch angle exceeded {PITCH_LIMIT_RAD} rad, where the equations of motion become singular",
     }[outcome]
     return (
         f"the flight diverged at t = {t_ns / NANOSECONDS:.3f} s: {reason}; "

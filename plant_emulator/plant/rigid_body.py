@@ -18,11 +18,11 @@ from protocol.messages import FloatArray
 from protocol.scenario import Body, Disturbance
 
 Specific: TypeAlias = tuple[float, float, float, float, float, float]
-"""A wrench over the inertia it works on: force / m (m/s^2), torque_i / I_ii (rad/s^2), body frame."""
+"""A wrench divided by the inertia: force / m (m/s^2), torque_i / I_ii (rad/s^2), body frame."""
 
 
 class BodyParameters(NamedTuple):
-    """What the equations of motion need, prepared for the kernels.
+    """Parameters of the equations of motion, prepared for the kernels.
 
     mass                kg
     specific (6,)       1/m three times, then 1/Ixx, 1/Iyy, 1/Izz: a wrench times this is specific
@@ -66,14 +66,14 @@ def acceleration(
 ) -> Specific:
     """q'' (m/s^2, rad/s^2) at these angles (rad) and their rates (rad/s) under a specific wrench in the body frame.
 
-    Singular at cos(beta) = 0; the caller keeps |beta| below 1.4 rad.
+    Singular at cos(pitch) = 0; the caller keeps |pitch| below 1.4 rad.
     """
     sa, ca = math.sin(alpha), math.cos(alpha)
     sb, cb = math.sin(beta), math.cos(beta)
     sg, cg = math.sin(gamma), math.cos(gamma)
     fx, fy, fz, tx, ty, tz = wrench
 
-    # R^IB f, with what the rows share.
+    # R^IB f, with the common terms of its rows.
     side, lift = sa * fy + ca * fz, ca * fy - sa * fz
     ahead = cb * fx + sb * side
     # Body rates w = T q_r'.

@@ -1,7 +1,7 @@
-"""The safety envelope: what a command must pass before it reaches a motor. It starts at "no output".
+"""The safety envelope: the checks between a received command and the motors. Its output starts at zero.
 
-It sits apart from control and trusts nothing: commands are clamped to the actuators' limits, a disarmed command turns the
-motors to zero, and a command that has grown stale turns each channel to its safe value.
+It is independent of control: commands are clamped to the actuators' limits, a disarmed command sets the
+motors to zero, and a stale command sets each channel to its safe value.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from protocol.messages import FloatArray
 from protocol.scenario import NANOSECONDS, Actuators
 
 _TOLERANCE = 1e-6
-"""Part of a channel's range that float32 may add to a limit without the clamp being counted."""
+"""Part of a channel's range by which float32 rounding may exceed a limit without being counted as clamped."""
 
 CAUSES = ("clamped", "disarmed", "stale")
 CLAMPED, DISARMED, STALE = range(len(CAUSES))
-_OUTAGE = -1  # in place of the last command's time: the safe output has been given
+_OUTAGE = -1  # instead of the last command's time: the safe output is active
 
 
 @compiled
@@ -34,7 +34,7 @@ def clamp(tau: FloatArray, lower: FloatArray, upper: FloatArray, allowed: FloatA
 
 @compiled
 def pass_command(envelope: Any, t_ns: int, tau: FloatArray, armed: bool) -> None:
-    """Fill envelope.allowed (6,) with what the motors get of a command that came at simulation time t_ns."""
+    """Fill envelope.allowed (6,) with the motors' part of a command received at simulation time t_ns."""
     envelope.last_ns = t_ns
     if not armed:
         envelope.counters[DISARMED] += 1
@@ -45,7 +45,7 @@ def pass_command(envelope: Any, t_ns: int, tau: FloatArray, armed: bool) -> None
 
 @compiled
 def expired_ns(envelope: Any, t_ns: int) -> int:
-    """When the last command grew stale, once per outage; -1 where it is not too old at t_ns, or that was said before."""
+    """When the last command became stale, once per outage; -1 where it is not stale at t_ns, or this was reported before."""
     if envelope.last_ns == _OUTAGE or t_ns - envelope.last_ns <= envelope.staleness_ns:
         return -1
     since_ns = envelope.last_ns + envelope.staleness_ns
@@ -58,9 +58,9 @@ class SafetyEnvelope:
     """Limits, arming and staleness.
 
     packed     the envelope as the kernels take it
-    counters   clamped   commands that were beyond a limit
-               disarmed  commands that came without arming
-               stale     times the output went to its safe value because no command came within staleness_s
+    counters   clamped   commands that exceeded a limit
+               disarmed  commands that were sent disarmed
+               stale     times the output switched to its safe value because no command arrived within staleness_s
     """
 
     def __init__(self, actuators: Actuators) -> None:
@@ -71,7 +71,7 @@ class SafetyEnvelope:
                 "upper": np.array(actuators.upper),
                 "allowed": np.zeros(6),
                 "staleness_ns": round(actuators.staleness_s * NANOSECONDS),
-                "last_ns": 0,  # from t = 0 on a first command is awaited, like any other
+                "last_ns": 0,  # the first command is due within staleness_s of t = 0, like any other
                 "counters": np.zeros(len(CAUSES), dtype=np.int64),
             }
         )
@@ -79,15 +79,15 @@ class SafetyEnvelope:
 
     @property
     def counters(self) -> dict[str, int]:
-        """What was counted so far."""
+        """The counters so far."""
         return dict(zip(CAUSES, self.packed["counters"][0].tolist(), strict=True))
 
     def pass_command(self, t_ns: int, tau: FloatArray, *, armed: bool) -> FloatArray:
-        """What the motors get of a command tau (6,) that came at simulation time t_ns."""
+        """The motors' part of a command tau (6,) received at simulation time t_ns."""
         pass_command(self.packed[0], t_ns, tau, armed)
         return self.allowed.copy()
 
     def stale_output(self, t_ns: int) -> tuple[int, FloatArray] | None:
-        """(time it begins to act, safe tau) once per outage, where the last command is too old at t_ns; else None."""
+        """(time it begins to act, safe tau) once per outage, where the last command is stale at t_ns; else None."""
         since_ns = expired_ns(self.packed[0], t_ns)
         return None if since_ns < 0 else (since_ns, self._safe.copy())

@@ -1,7 +1,7 @@
-"""What the emulator measures: pose with noise for the laws; an IMU, pressure and field for real autopilots.
+"""The emulator's sensors: pose with noise for the laws; IMU, pressure and magnetic field for real autopilots.
 
-Each sensor draws from a generator of its own, keyed by its name, once for every tick whether or not the frame arrives:
-adding a sensor shifts no other one's noise.
+Each sensor draws from a random generator of its own, keyed by its name, once for every tick whether or not the frame
+arrives: adding a sensor does not change another sensor's noise.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from protocol.rotations import rotate_to_body
 from protocol.scenario import World
 
 NOISE_BLOCK = 1024
-"""Ticks whose noise is drawn at once."""
+"""Number of ticks whose noise is drawn at once."""
 EARTH_RADIUS = 6_371_000.0
 
 
@@ -50,7 +50,7 @@ class PositionSensor:
 def inertial_readings(
     motion: FloatArray, force: FloatArray, field: FloatArray, altitude: float, readings: FloatArray
 ) -> None:
-    """Fill readings (13,) but the last; force (3,) is the specific force (m/s^2), altitude that of the origin."""
+    """Fill readings (13,) except the last; force (3,) is the specific force (m/s^2), altitude that of the origin."""
     for i in range(3):
         readings[i] = force[i]
     readings[3], readings[4], readings[5] = body_rates(motion)
@@ -58,7 +58,7 @@ def inertial_readings(
         motion[3], motion[4], motion[5], field[0], field[1], field[2]
     )
     altitude -= motion[2]
-    # Above 44 km the formula has no more air; without the bound its power would be no real number.
+    # Above 44 km the formula's pressure is zero; without the bound its power would not be a real number.
     readings[9] = 1013.25 * max(0.0, 1.0 - 2.25577e-5 * altitude) ** 5.25588
     readings[10] = 0.0
     readings[11] = altitude
@@ -78,7 +78,7 @@ class InertialSensors:
         self._readings[12] = world.temperature_celsius
 
     def measure(self, motion: FloatArray, force: FloatArray) -> FloatArray:
-        """The readings (13,) that `mapping.encode_tick` takes, of a specific force (3,); the next call overwrites them."""
+        """The readings (13,) for `mapping.encode_tick`, of a specific force (3,); the next call overwrites them."""
         inertial_readings(motion, force, self._field, self._world.altitude, self._readings)
         return self._readings
 

@@ -1,6 +1,6 @@
-"""Ground truth on disk: one row a tick, in a NumPy file that grows and can be read at any moment.
+"""Ground truth on disk: one row per tick, in a growing NumPy file that can be read at any time.
 
-`numpy.load("ground_truth.npy")` gives a structured array. It holds velocities, so it goes to disk and never to a controller.
+`numpy.load("ground_truth.npy")` gives a structured array. It holds velocities, so it is never sent to a controller.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ _BLOCK = 1024
 
 
 class TruthWriter(AppendFile):
-    """Appends rows; the file's header is rewritten at each flush, so the file is whole up to the last one.
+    """Appends rows; the file's header is rewritten at each flush, so the file is valid up to the last flush.
 
-    Where the disk refuses, RunFolderError is raised; with `tell`, that hears of it once instead, and rows are left out from
-    there on (`lost`): a file with a hole in its time would not be what it says it is.
+    Where writing fails, RunFolderError is raised; with `tell`, that is called once instead, and no further rows are written
+    (`lost`), so that the file has no gap in time.
     """
 
     def __init__(self, path: Path, tell: Callable[[str], None] | None = None) -> None:
@@ -62,14 +62,14 @@ class TruthWriter(AppendFile):
         self._pending += 1
 
     def flush(self) -> None:
-        """Write what is pending and make the header say so."""
+        """Write the pending rows and update the header."""
         if not self._pending:
             return
         if self.lost:
             self._leave_out()
             return
         try:
-            self._file.seek(len(_header(0)) + self._count * ROW.itemsize)  # a failed flush may have left a part behind
+            self._file.seek(len(_header(0)) + self._count * ROW.itemsize)  # a failed flush may have written a part
             self._write(self._block[: self._pending].tobytes())
             self._count += self._pending
             self._pending = 0
@@ -86,7 +86,7 @@ class TruthWriter(AppendFile):
         self._pending = 0
 
     def _write(self, data: bytes) -> None:
-        """Write all of it: one unbuffered write may stop short, as on a disk that is nearly full."""
+        """Write all of it: one unbuffered write may be short, as on a disk that is nearly full."""
         rest = memoryview(data)
         while rest:
             rest = rest[self._file.write(rest) :]
@@ -102,7 +102,7 @@ def _header(count: int) -> bytes:
 
 
 def load_truth(path: Path) -> npt.NDArray[np.void]:
-    """The rows of a ground truth file. Raises RunFolderError where there is none."""
+    """The rows of a ground truth file. Raises RunFolderError where it cannot be read."""
     try:
         rows: npt.NDArray[np.void] = np.load(path)
     except (OSError, EOFError, ValueError) as error:

@@ -132,7 +132,7 @@ def test_a_law_adopts_gains_in_place_and_then_steps_as_one_made_with_them() -> N
     for tick in range(5):
         q = np.full(6, 0.2 + 0.01 * tick)
         assert np.array_equal(law.step(state, tick * law.period_ns, q), other.step(theirs, tick * law.period_ns, q))
-    with pytest.raises(UsageError, match="cannot take the place"):
+    with pytest.raises(UsageError, match="cannot replace the running law"):
         law.adopt(make_law("ude", replace_gains(FLAPPER, "filters", order=3)))
 
 

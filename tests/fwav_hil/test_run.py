@@ -169,7 +169,7 @@ def test_a_budget_that_is_all_but_used_up_is_a_warning_before_anything_flies(
     with pytest.raises(NoFlightError):
         fwav_hil.run.run(scenario_of("paper", rate_hz=200.0), tmp_path, options)
     told = capsys.readouterr().err
-    assert ("warning: delay budget (ude, 200 Hz): the gains stand 3.38 ms" in told) != quiet
+    assert ("warning: delay budget (ude, 200 Hz): the gains are stable up to 3.38 ms" in told) != quiet
     assert ("unstable" in told) != quiet
 
 
@@ -241,7 +241,10 @@ def test_a_taken_port_is_one_sentence(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("end", "link", "part"),
-    [("emulator", "udpin://127.0.0.1:0", "no controller came"), ("controller", "udpout://127.0.0.1:9", "no emulator")],
+    [
+        ("emulator", "udpin://127.0.0.1:0", "no controller connected"),
+        ("controller", "udpout://127.0.0.1:9", "no emulator"),
+    ],
 )
 def test_a_missing_peer_is_one_sentence(end: str, link: str, part: str, tmp_path: Path) -> None:
     done = call(end, "flapper", "--link", link, "--wait", "0.5", cwd=tmp_path)

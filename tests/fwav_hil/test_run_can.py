@@ -76,8 +76,8 @@ def test_a_killed_motor_process_is_started_again_and_met_again(tmp_path: Path) -
         wait_until(lambda: processes_of(tmp_path).get("motor", first) != first)
         _, errors = run.communicate(timeout=2 * PATIENCE_S)
     assert run.returncode == 0, errors
-    assert "the motor process was ended by signal 9: started again (1 of 3)" in errors
-    assert "the drives are back" in errors
+    assert "the motor process was ended by signal 9: restarted (1 of 3)" in errors
+    assert "the drives answer again" in errors
     counters = json.loads((folder / "emulator.json").read_text())["counters"]
     truth = load_truth(folder / "ground_truth.npy")
     assert len(truth) == 1250
@@ -185,7 +185,7 @@ def test_drives_alone_obey_a_controller_that_knows_only_the_published_dbc(tmp_pa
             pass  # the commands have ended
         second = call("motor", "two.toml", "--can", uri, "--protocol", "odrive", cwd=tmp_path)
         assert second.returncode == 3
-        assert_one_line(second.stderr, "drives on the CAN bus", "already")
+        assert_one_line(second.stderr, "the CAN bus", "already has drives")
         drives.send_signal(signal.SIGINT)
         _, errors = drives.communicate(timeout=PATIENCE_S)
     assert drives.returncode == 0, errors

@@ -94,7 +94,9 @@ def test_a_divergence_ends_the_run_and_is_named(delay_s: float) -> None:
     count = len(run.t_ns)
     assert 0 < count < scenario.ticks
     assert run.divergence is not None
-    assert run.divergence.startswith(f"the flight diverged at t = {count / 250:.3f} s: the pitch angle passed 1.4 rad")
+    assert run.divergence.startswith(
+        f"the flight diverged at t = {count / 250:.3f} s: the pitch angle exceeded 1.4 rad"
+    )
     assert all(getattr(run, field).shape == (count, 6) for field in FIELDS)
     assert np.abs(run.q[:, 4]).max() < 1.4, "the rows are those from before"
     assert run.law_counts["steps"] == count
@@ -106,7 +108,7 @@ def test_a_queue_that_is_too_short_for_the_delay_ends_the_run_and_is_named() -> 
     run = simulate(scenario)
     assert len(run.t_ns) == PENDING
     assert run.divergence is not None
-    assert f"more than {PENDING} commands are on their way" in run.divergence
+    assert f"more than {PENDING} delayed commands are pending" in run.divergence
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 250.0, 1000.0])

@@ -90,7 +90,7 @@ class TestDiskThatFillsUp:
         assert isinstance(outcome, dict), outcome
         assert (outcome["ticks"], outcome["error"]) == (2000, None)
         assert sorted("run.tlog" in text for text in warnings) == [False, True]
-        assert all("File too large; the run goes on" in text for text in warnings)
+        assert all("File too large; the run continues" in text for text in warnings)
         self._assert_a_part(tmp_path / "run")
 
     @staticmethod

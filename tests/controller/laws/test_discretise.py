@@ -109,7 +109,7 @@ def test_output_feedback_needs_a_filter_of_second_order(flapper: Scenario) -> No
     """As the paper says below (21); with the velocity at hand the first order will do."""
     first = replace_gains(flapper, "filters", order=1)
     with pytest.raises(
-        ScenarioError, match=r"gains\.filters: .* filter of order 2 or more, this one has 1: set order = 2"
+        ScenarioError, match=r"gains\.filters: .* filter of order 2 or more, but order is 1: set order = 2"
     ):
         first.read_gains("filters", Filters)
     filters = first.read_gains("filters", StateFeedbackFilters)

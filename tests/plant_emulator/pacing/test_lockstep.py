@@ -262,7 +262,7 @@ def test_silence_ends_the_run_with_a_named_error_and_a_log_up_to_there(tmp_path:
         mute = Faulty(far, lambda count, data: [] if count > 30 else [data])
         ends = fly_both(SHORT, near, mute, tmp_path)
     assert isinstance(ends.emulator, PeerLostError)
-    assert "no answer" in str(ends.emulator)
+    assert "did not answer" in str(ends.emulator)
     rows = load_truth(tmp_path / "ground_truth.npy")
     answers = [f for _, f in read_tlog(tmp_path / "run.tlog") if f.message_id == mapping.COMMAND.message_id]
     assert 0 < len(rows) == len(answers) < 30

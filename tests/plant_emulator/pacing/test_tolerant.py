@@ -172,7 +172,7 @@ def test_one_that_falls_silent_is_flown_safely_for_a_while_and_then_named(
 
 def test_one_that_never_answers_is_waited_for_with_a_bound() -> None:
     near, far = memory_pair()
-    with near, FakePx4(far, silent=10**9), pytest.raises(PeerLostError, match="see whether it still runs"):
+    with near, FakePx4(far, silent=10**9), pytest.raises(PeerLostError, match="check that it still runs"):
         fly_px4(flapper(250.0, 60.0), near, wait_s=0.4)
 
 
@@ -193,7 +193,7 @@ def test_over_tcp_as_px4_comes() -> None:
 
 def test_it_is_of_lockstep_only() -> None:
     options = EmulatorOptions(link="mem://none", clock="realtime", profile="tolerant")
-    with pytest.raises(UsageError, match="of lockstep"):
+    with pytest.raises(UsageError, match="needs lockstep"):
         run_emulator(flapper(250.0, 1.0), options, lambda _event: None, StopFlag())
 
 
