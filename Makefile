@@ -37,10 +37,10 @@ fuzz: $(READY)
 
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-	    { echo "fwav-hil needs Python 3.11 or newer: call make with PYTHON=python3.12, say" >&2; exit 1; }
-	@echo "making the environment $(VENV) (some seconds)"
+	    { echo "fwav-hil needs Python 3.11 or newer: call make with, for example, PYTHON=python3.12" >&2; exit 1; }
+	@echo "creating the environment $(VENV) (some seconds)"
 	@$(PYTHON) -m venv $(VENV)
-	@echo "installing into it what constraints.txt lists (1 GB; the first time one to three minutes, nothing is shown meanwhile)"
+	@echo "installing the packages of constraints.txt (1 GB; the first time one to three minutes, without output)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS)]'
 	@touch $@
 

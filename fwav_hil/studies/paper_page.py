@@ -22,24 +22,24 @@ TITLES = {
 }
 
 INTRODUCTION = """\
-# The paper, run again
+# The paper, reproduced
 
 Made by `fwav-hil paper`; do not edit. Errors are in the paper's units (cm, rad), over the whole 10 s, at 1 kHz, without noise.
-Each cell reads: paper / ours (ours over paper). `paper` is the paper's run as far as it is stated; `paper_disturbed` adds a
-body torque that nothing in the paper states, a hypothesis made after seeing its tables. `docs/mathematics.md` says what was
-read how.
+Each cell reads: paper / ours (ratio ours to paper). `paper` is the paper's run as far as it is stated; `paper_disturbed` adds
+a body torque that is not in the paper, a hypothesis made after seeing its tables. `docs/mathematics.md` explains how the
+paper was interpreted.
 
-## Why cells differ
+## Why our results differ
 
 - **Units.** The paper names none; CGS is the only reading in which one b = 2 suits all channels.
-- **Lambda.** The paper gives no value; 1/s is ours. So is the extra pole N = 1000/s, without which (21) cannot be run.
-- **Start of the reference.** Not given: 0 in position, q(0) in attitude. Most of the position error is the first second's.
-- **The hysteresis is too small to see.** With chi = 1 per dyn its width is 2.8 of about 1700 units of tau: it cannot make the
-  gap between the columns of Table III. In ours that gap comes from what else the estimate removes, gravity first of all.
-- **Attitude.** In the equations as stated hardly anything disturbs it, so ours is far smaller; the torque of `paper_disturbed`
-  brings PD and T = 1 near the paper's.
+- **Lambda.** The paper gives no value; we chose 1/s, and the extra pole N = 1000/s, without which (21) cannot be run.
+- **Start of the reference.** Not given; we chose 0 in position, q(0) in attitude. Most position error is in the first second.
+- **The hysteresis is too small to see.** With chi = 1 per dyn its width is 2.8 of about 1700 units of tau: it cannot explain
+  the gap between the columns of Table III. In ours that gap comes from other effects that the estimate removes, mainly gravity.
+- **Attitude.** The equations as stated contain hardly any disturbance of it, so our errors are far smaller; the torque of
+  `paper_disturbed` brings PD and T = 1 near the paper's.
 - **"UDE smallest in all" fails in the paper's own Table II**: the DOB wins five position cells.
-- **A DOB with equal gains and feed-forward is the UDE**, digit for digit but for the rounding of its gains (last table, beside
+- **A DOB with equal gains and feed-forward is the UDE**, digit for digit except for the rounding of its gains (last table and
   the UDE of Table II); the gap in Table II is one of gains and feed-forward.
 """
 
