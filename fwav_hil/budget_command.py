@@ -21,9 +21,9 @@ def budget(
     link: Annotated[str, Option("--link", "The link, at either end: serial://, udpin://, tcpout:// ...", "URI")],
     json_path: JsonPath = None,
 ) -> None:
-    """Say whether SCENARIO's messages fit a link at a rate, and what each hop of the loop adds to the delay.
+    """Compute whether SCENARIO's messages fit a link at a rate, and what each hop of the loop adds to the delay.
 
-    Nothing is opened. `emulator` and `controller` ask the same before they keep wall time on a serial line.
+    No link is opened. In real time on a serial line `emulator` and `controller` make the same check at their start.
 
     \b
     Exit code: 0 where the rate fits, else 2.
@@ -60,22 +60,22 @@ def _print(found: Budget, planned_s: float, *, to_stderr: bool) -> None:
         if way.overhead_bytes_per_s:
             overhead = way.overhead_bytes_per_s
             table.add_row("  headers of datagrams", "", "", f"{overhead:.0f}", _percent(overhead / capacity))
-        table.add_row(f"  together, of {capacity:.0f}", "", "", f"{way.bytes_per_s:.0f}", _percent(way.share))
+        table.add_row(f"  total, of {capacity:.0f}", "", "", f"{way.bytes_per_s:.0f}", _percent(way.share))
     console.print(table)
     table = Table("hop", title="From a sample to its command", title_justify="left")
     table.add_column("delay", justify="right")
     table.add_column("")
     for hop in found.hops:
         table.add_row(hop.name, f"{1e3 * hop.delay_s:.3f} ms", hop.note)
-    table.add_row("together", f"{1e3 * found.delay_s:.3f} ms", f"{found.delay_periods:.2f} periods")
+    table.add_row("total", f"{1e3 * found.delay_s:.3f} ms", f"{found.delay_periods:.2f} periods")
     console.print(table)
     console.print(
-        "The two processes' own time comes on top (`fwav-hil latency` measures it), and the plant holds each command for a "
-        f"period. In lockstep and `simulate` the scenario's own delay stands in for all this: {1e3 * planned_s:g} ms."
+        "The processes' computing time adds to this (`fwav-hil latency` measures it), and the plant holds each command for a "
+        f"period. In lockstep and `simulate` the scenario's delay replaces all of this: {1e3 * planned_s:g} ms."
     )
     if found.delay_periods > 1:
         console.print(
-            "A command comes after the next tick has left: it answers an older sample, and ticks count as unanswered."
+            "A command arrives after the next tick was sent: it answers an older sample, and ticks count as unanswered."
         )
 
 

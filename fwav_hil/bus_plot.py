@@ -1,4 +1,4 @@
-"""The gears as the motor bus shows them: shaft angles before and after, from the record of the bus alone."""
+"""The gears as recorded on the motor bus: shaft angles before and after, from the bus log alone."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from protocol.scenario import Scenario
 
 
 def read_encoders(log: Path) -> list[FloatArray]:
-    """For each axis (n, 2): motor and output angle, rad, in the order of the record."""
+    """For each axis (n, 2): motor and output angle, rad, in the order of the log."""
     import can
 
     points: list[list[tuple[float, float]]] = [[] for _ in range(DRIVES)]
@@ -28,7 +28,7 @@ def read_encoders(log: Path) -> list[FloatArray]:
 
 
 def plot_bus(log: Path, scenario: Scenario, title: str) -> Path:
-    """u against tau, worked out of the encoders on the bus; drawn beside the record."""
+    """Plot u against tau, computed from the encoder frames on the bus; saved beside the log."""
     path = log.with_name("hysteresis_bus.png")
     unit = np.array(scenario.actuators.scale) / scenario.motor.travel_rad
     curves = [points * unit[axis] for axis, points in enumerate(read_encoders(log))]

@@ -1,4 +1,4 @@
-"""The two processes of a run, seen from their parent: start them, hear them, end them; never leave one behind."""
+"""The child processes of a run, seen from their parent: start them, read their reports, end them, leave none running."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _GRACE_S = 5.0
 class Child:
     """A process that does a job (`fwav_hil/jobs.py`) and reports one JSON object a line on its standard output.
 
-    name   which process, one of `jobs.PROCESSES`: as it is called in messages, and calls itself on standard error
+    name   which process, one of `jobs.PROCESSES`: used in messages, and by the process itself on standard error
     """
 
     def __init__(self, name: str, job: Job[Any], module: str = "fwav_hil.jobs") -> None:
@@ -36,12 +36,12 @@ class Child:
 
     @property
     def failure(self) -> str | None:
-        """Why it ended, in one sentence; None where it ended well, as it was asked to, or runs on."""
+        """Why it ended, in one sentence; None where it ended without error, was asked to end, or still runs."""
         code = self.process.poll()
         if not code or (self._asked and code in (-signal.SIGTERM, Interrupted.exit_code)):
             return None
         lines = [line for line in self.error.splitlines() if line.strip()]
-        if lines and code > 0:  # a process that was killed had no last word
+        if lines and code > 0:  # a process that was killed wrote no error message
             return lines[-1].removeprefix(f"{self.name}: ")
         how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
         return f"the {self.name.replace('_', ' ')} process {how}"
@@ -56,7 +56,7 @@ class Child:
                 pass  # it has ended; its exit code says why
 
     def ask_to_end(self) -> None:
-        """Say that nothing more will be told, and send SIGTERM, if it still runs."""
+        """Close its standard input, and send SIGTERM if it still runs."""
         if self.process.poll() is None:
             self._asked = True
             if self.process.stdin:
@@ -64,16 +64,16 @@ class Child:
             self.process.terminate()
 
     def events_in(self, data: bytes) -> Iterator[dict[str, Any]]:
-        """The reports that `data`, the next bytes of its standard output, completes."""
+        """The reports completed by `data`, the next bytes of its standard output."""
         *lines, self._partial = (self._partial + data).split(b"\n")
         for line in lines:
             try:
                 yield msgspec.json.decode(line, type=dict[str, Any])
             except ValueError:  # not JSON, not an object, not UTF-8
-                self.error += line.decode(errors="replace") + "\n"  # a library that printed
+                self.error += line.decode(errors="replace") + "\n"  # printed by a library
 
     def end(self) -> None:
-        """Wait a little for it to end by itself, then ask it to, then make it."""
+        """Wait briefly for it to end by itself, then terminate it, then kill it."""
         for signal_it in (None, self.process.terminate, self.process.kill):
             if signal_it:
                 signal_it()
@@ -91,10 +91,10 @@ class Child:
 
 
 def listen(children: list[Child]) -> Iterator[tuple[Child | None, dict[str, Any]]]:
-    """The reports of all children as they come, until every one has closed its output.
+    """The reports of all children as they arrive, until every child has closed its output.
 
-    Ten times a second at least something is yielded: (None, {}) where nothing came, so that a caller can look around. The
-    list may grow meanwhile: further children are heard from then on.
+    At least ten times a second something is yielded: (None, {}) where nothing arrived, so that the caller can do other work.
+    Children added to the list meanwhile are read too.
     """
     with selectors.DefaultSelector() as selector:
         heard = 0

@@ -26,19 +26,19 @@ COMMANDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "simulate": ("fwav_hil.cli:simulate_command", "Fly a scenario in this process, without a link."),
         "emulator": ("fwav_hil.commands.emulator:emulator", "Run the plant emulator alone."),
         "controller": ("fwav_hil.commands.controller:controller", "Run the controller alone."),
-        "latency": ("fwav_hil.latency.command:latency", "Measure where the time goes in the loop or on a link."),
-        "motor": ("fwav_hil.commands.motor:motor", "Be six simulated drives on a CAN bus."),
-        "paper": ("fwav_hil.studies.paper_command:paper_command", "Run the source paper's section IV again."),
-        "margin": ("fwav_hil.studies.margin_command:margin_command", "Say whether the gains stand the link."),
-        "design": ("fwav_hil.studies.design_command:design_command", "Search gains for a link."),
-        "record": ("fwav_hil.record_command:record_command", "Record what comes over a live link, sending nothing."),
+        "latency": ("fwav_hil.latency.command:latency", "Measure the latency of the loop or of a link."),
+        "motor": ("fwav_hil.commands.motor:motor", "Run six simulated drives on a CAN bus."),
+        "paper": ("fwav_hil.studies.paper_command:paper_command", "Reproduce section IV of the source paper."),
+        "margin": ("fwav_hil.studies.margin_command:margin_command", "Stability margins of the gains on a link."),
+        "design": ("fwav_hil.studies.design_command:design_command", "Search for gains for a link."),
+        "record": ("fwav_hil.record_command:record_command", "Record what arrives on a live link, sending nothing."),
         "replay": (
             "fwav_hil.replay.command:replay_command",
             "Replay a log: to a link, into a controller, into the plant.",
         ),
         "diff": ("fwav_hil.replay.diff_command:diff_command", "Compare two logs, sample by sample."),
-        "doctor": ("fwav_hil.doctor_command:doctor", "Say what this machine can promise in real time."),
-        "budget": ("fwav_hil.budget_command:budget", "Say whether a rate fits a link, and what each hop delays."),
+        "doctor": ("fwav_hil.doctor_command:doctor", "Test which rates this machine keeps in real time."),
+        "budget": ("fwav_hil.budget_command:budget", "Check that a rate fits a link; the delay of each hop."),
         "report": ("fwav_hil.cli:report_command", "Score and plot a run folder again."),
         "log": ("fwav_hil.logs.command:log_group", "Read telemetry logs: info, dump, plot, export."),
     }
@@ -54,7 +54,7 @@ Example:
 
 
 class _LazyGroup(click.Group):
-    """A group whose commands are imported when they are called; their help lines stand in the table above."""
+    """A group whose commands are imported when they are called; their help lines are in the table above."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -92,9 +92,9 @@ def run_command(
     plots: Plots = True,
     json_path: JsonPath = None,
 ) -> None:
-    """Fly SCENARIO with the emulator and the controller as two processes that speak MAVLink over a link.
+    """Fly SCENARIO with the emulator and the controller as two processes that exchange MAVLink over a link.
 
-    With --motor can the drives are a third one, on a CAN bus.
+    With --motor can the drives are a third process, on a CAN bus.
     """
     scenario = choice.load()
     from bridge.command_line import refuse_rate_that_cannot_fit
@@ -113,7 +113,7 @@ def run_command(
         refuse_rate_that_cannot_fit(options.link, scenario.rate_hz)
     elif options.emulator.delay_ns or options.legs:
         raise UsageError(
-            "--delay and --legs are of real time: add --clock realtime (in lockstep the scenario's [delay] is)"
+            "--delay and --legs need real time: add --clock realtime (in lockstep the scenario's [delay] applies)"
         )
     if options.emulator.motors:
         check_motors(scenario, options.emulator.motors)
@@ -122,7 +122,7 @@ def run_command(
     try:
         run(scenario, folder, options)
     except FwavHilError:
-        # The run's own error is the one to end with, whatever else its folder gives trouble with.
+        # The run's own error is reported, even if reading its folder fails too.
         with contextlib.suppress(FwavHilError):
             _finish(folder, json_path, plots=plots)
         raise
@@ -133,7 +133,7 @@ def run_command(
 def simulate_command(
     choice: ScenarioChoice,
     seeds: Annotated[
-        int | None, Option("--seeds", "Fly N seeds from the first on and show the spread.", "N", min=1)
+        int | None, Option("--seeds", "Fly N seeds, beginning with the scenario's, and show the spread.", "N", min=1)
     ] = None,
     out: Annotated[
         Path | None,
@@ -153,7 +153,7 @@ def simulate_command(
     check_law(scenario, choice.path)
 
     if seeds and out:
-        raise UsageError("--seeds flies many runs and keeps none: leave out --out, or fly one --seed at a time")
+        raise UsageError("--seeds saves no run: leave out --out, or fly one --seed at a time")
     if seeds:
         spread = simulate_spread(scenario, seeds)
         print_spread(spread, to_stderr=is_stdout(json_path))
@@ -174,7 +174,7 @@ def simulate_command(
 def report_command(
     folder: Annotated[Path, Argument(type=EXISTING_FOLDER)], plots: Plots = True, json_path: JsonPath = None
 ) -> None:
-    """Score and plot the run in FOLDER again, whatever became of the commands that flew it."""
+    """Score and plot the run in FOLDER again, also after a run that failed or was interrupted."""
     from fwav_hil.report import summarise
 
     summarise(folder)
@@ -182,7 +182,7 @@ def report_command(
 
 
 def _finish(folder: Path, json_path: Path | None, *, plots: bool) -> None:
-    """Draw, print and hand on what a run folder holds; says where it is even where it holds nothing yet."""
+    """Draw, print and return the results in a run folder; prints its path even where it holds no results."""
     from bridge.summary import read_json, write_json
     from fwav_hil.run_folder import FILES
     from fwav_hil.tables import print_summary

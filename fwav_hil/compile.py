@@ -1,4 +1,4 @@
-"""Compile the kernels once, before two processes would do it side by side."""
+"""Compile the kernels once, before two processes would compile them at the same time."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _BOTH_ENDS = ("controller", "plant_emulator")
 
 
 def compile_kernels(scenario: Scenario) -> None:
-    """Have every kernel of a run, and of its drives on a bus, in the cache. Does nothing where they are."""
+    """Compile every kernel of a run, and of its drives on a bus, into the cache. Does nothing where they are there."""
     if kernels_are_warm(*_BOTH_ENDS):
         return
-    click.echo("compiling the kernels (after an installation or an edit of theirs, up to half a minute) ...", err=True)
+    click.echo("compiling the kernels (needed once after installation or a change; up to half a minute) ...", err=True)
     import controller.process
     import plant_emulator.process
     from controller.laws.law import make_law

@@ -29,11 +29,11 @@ def doctor(
     )] = RATES_HZ,
     json_path: JsonPath = None,
 ) -> int:  # fmt: skip
-    """Say what this machine can promise in real time, and what would mend what it cannot.
+    """Test which rates this machine keeps in real time, and show how to improve it.
 
-    Each rate is kept for some seconds by a process that does nothing else, first an ordinary one, then one with all that
-    --realtime asks for. A rate counts as kept where p99.9 of the lateness is within a tenth of the period and no period is
-    missed. Nothing is changed for good.
+    Each rate is tried for some seconds by a process that only waits for its periods, first as an ordinary process, then with
+    everything that --realtime requests. A rate counts as kept if the 99.9th percentile of the lateness is within a tenth of
+    the period and no period is missed. No lasting change is made to the system.
 
     \b
     Exit code: 0 where every rate is kept with --realtime, else 1.
@@ -48,7 +48,7 @@ def doctor(
     settings: Settings = ()
     for rate_hz in rates_hz:
         for realtime in (False, True):
-            # One line, and nothing that moves: a bar of its own thread would take time from what is measured.
+            # One line instead of a progress bar: the bar's thread would disturb the measurement.
             click.echo(f"waking at {rate_hz:g} Hz for {seconds:g} s, {_how(realtime=realtime)} ...", err=True)
             trial, said = try_wake_ups(MonotonicClock(), rate_hz, seconds, own_core(0), realtime=realtime)
             trials.append(trial)
@@ -96,7 +96,7 @@ def _print(
     for finding in findings:
         table.add_row(finding.name, finding.found, marks[finding.good])
     console.print(table)
-    table = Table("--realtime asks for", "granted", "", title="What the system grants", title_justify="left")
+    table = Table("--realtime requests", "granted", "", title="What the system grants", title_justify="left")
     for setting in settings:
         table.add_row(setting.name, "yes" if setting.granted else "no", setting.said)
     console.print(table)
@@ -115,7 +115,7 @@ def _print(
     remedies = [(finding.name, finding.remedy) for finding in findings if finding.remedy]
     remedies += [(setting.name, setting.remedy) for setting in settings if setting.remedy]
     if remedies:
-        console.print("What would mend it:")
+        console.print("To improve it:")
     for name, remedy in dict(remedies).items():
         console.print(f"  {name}: {remedy}")
     for line in verdicts:

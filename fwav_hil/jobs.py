@@ -1,4 +1,4 @@
-"""What a process of a run is told, as one structure; and that process: `python -m fwav_hil.jobs NAME`.
+"""The job of a child process as one structure, and that process: `python -m fwav_hil.jobs NAME`.
 
 It reads its job from the first line of its standard input, reports one JSON object a line on its standard output, and ends
 with its parent.
@@ -34,7 +34,7 @@ Options = TypeVar("Options")
 
 
 class Job(msgspec.Struct, Generic[Options], frozen=True):
-    """What one process is to do, and the core that it is to sit on, if it matters."""
+    """What one process has to do, and its core affinity, if any."""
 
     scenario: Scenario
     options: Options
@@ -42,18 +42,18 @@ class Job(msgspec.Struct, Generic[Options], frozen=True):
 
     def encode(self) -> str:
         """One line of JSON."""
-        return msgspec.json.encode(self, enc_hook=str).decode()  # str: of a Path
+        return msgspec.json.encode(self, enc_hook=str).decode()  # str: for a Path
 
 
 def decode_job(line: str, options: type[Options]) -> Job[Options]:
     """The job in a line. Raises Interrupted where the line is empty, since the parent has ended."""
     if not line.strip():
-        raise Interrupted("interrupted before a job came on standard input")
+        raise Interrupted("interrupted before a job arrived on standard input")
     return msgspec.json.decode(line, type=Job[options], dec_hook=lambda kind, text: kind(text))  # type: ignore[valid-type]
 
 
 def do_job(name: str) -> None:
-    """Be the process of this name, until it ends. Raises the errors of `protocol.errors`."""
+    """Run the process of this name until it ends. Raises the errors of `protocol.errors`."""
     end_with_parent()
     options, run = (_named(place) for place in PROCESSES[name])
     job = decode_job(sys.stdin.readline(), options)

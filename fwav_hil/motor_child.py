@@ -1,4 +1,4 @@
-"""The drives of a run as a process of their own: started with the others, started again when killed, ended last."""
+"""The drives of a run as a process of their own: started with the others, restarted when killed, ended last."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOST_RESTARTS = 3
 class MotorKeeper:
     """Watches the process of the drives.
 
-    restarts   times it was started again, since a signal had ended it
+    restarts   times it was restarted after a signal had ended it
     """
 
     def __init__(self, job: Job[MotorOptions]) -> None:
@@ -27,20 +27,20 @@ class MotorKeeper:
         self.child = self._start()
 
     def look(self, children: list[Child], emulator: Child) -> None:
-        """Look after it: a new one joins `children`, and the emulator hears of it; one whose emulator has ended is ended."""
+        """Restart it if it was killed (added to `children`, the emulator is notified); end it once the emulator has ended."""
         code = self.child.process.poll()
         if emulator.process.poll() is not None:
             self.ask_to_end()
         elif code is not None and code < 0 and self.restarts < MOST_RESTARTS:
             self.restarts += 1
-            click.echo(f"{self.child.failure}: started again ({self.restarts} of {MOST_RESTARTS})", err=True)
-            self._ended.append(self.child)  # its pipes are still listened to
+            click.echo(f"{self.child.failure}: restarted ({self.restarts} of {MOST_RESTARTS})", err=True)
+            self._ended.append(self.child)  # its pipes are still read
             self.child = self._start()
             children.append(self.child)
             emulator.process.send_signal(signal.SIGURG)  # see `StopFlag`
 
     def ask_to_end(self) -> None:
-        """Ask it to end, since the run does; once, since a second time would end it on the spot."""
+        """Ask it to end with the run; only once, since a second request would end it immediately."""
         if not self._asked and self.child.process.poll() is None:
             self._asked = True
             self.child.ask_to_end()
@@ -52,14 +52,14 @@ class MotorKeeper:
 
     @property
     def failure(self) -> str | None:
-        """Why it has ended before the run, not to be started again, in one sentence; None where it has not."""
+        """Why it ended before the run and is not restarted, in one sentence; None where it still runs."""
         code = self.child.process.poll()
         if code is not None and code > 0:
             return self.child.failure
         if code is None or self._asked or (code < 0 and self.restarts < MOST_RESTARTS):
             return None
-        how = f"was ended by signal {-code}, started again {MOST_RESTARTS} times before" if code else "ended"
-        return f"the process of the drives {how}, and the run with it: see what ends it, and fly again"
+        how = f"was ended by signal {-code} after {MOST_RESTARTS} restarts" if code else "ended"
+        return f"the process of the drives {how}, which ended the run: find out what ends it, then run again"
 
     def _start(self) -> Child:
         return Child("motor", self._job)

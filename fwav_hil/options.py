@@ -1,4 +1,4 @@
-"""How a run is made."""
+"""The options of a run."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ RunFolder = Annotated[Path | None, folder_option("Folder of the run; by default 
 
 
 class RunOptions(EndOptions, frozen=True, kw_only=True):
-    """What both ends are told alike, and what each is told besides. An option of theirs is one of `fwav-hil run`, unless left
-    out here. What both share stands here; in `emulator` and `controller` it is of no effect.
+    """The shared options of both ends, and those of each end. All of these are options of `fwav-hil run`, except those left
+    out here. Shared options are set here; in `emulator` and `controller` they have no effect.
 
-    show_progress: False where the caller shows its own, and wants no line on the budget.
+    show_progress: False where the caller shows its own progress; then no budget line is printed either.
     """
 
     link: Annotated[str, Option(
@@ -41,7 +41,7 @@ class RunOptions(EndOptions, frozen=True, kw_only=True):
     show_progress: bool = True
 
     def of_ends(self, folder: Path, placement: Placement) -> tuple[EmulatorOptions, ControllerOptions]:
-        """What the processes are told. The controller is to wait for its link until the emulator has opened its own."""
+        """The options of the child processes. The controller waits for its link until the emulator has opened its own."""
         shared = {name: getattr(self, name) for name in EndOptions.__struct_fields__}
         shared |= {"spin_s": placement.spin_s, "out": folder}
         return (

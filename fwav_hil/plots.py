@@ -77,7 +77,7 @@ def gear_panels(path: Path, title: str, curves: Sequence[FloatArray]) -> None:
 
 
 def _show_limits(panel: Any, factor: float, scenario: Scenario, axis: int, values: FloatArray) -> None:
-    """Draw a limit that the command came near to, and only such: a far one would flatten the curve."""
+    """Draw only limits that the command came near to: distant ones would flatten the curve."""
     for limit in (scenario.actuators.lower[axis], scenario.actuators.upper[axis]):
         if len(values) and np.min(np.abs(values - limit)) < 0.1 * abs(limit):
             panel.axhline(factor * limit, color=EXTRA, linewidth=0.8, linestyle="--")

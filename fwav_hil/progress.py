@@ -1,4 +1,4 @@
-"""How far a run is, while it runs: a bar on a terminal, a line now and then elsewhere."""
+"""Progress of a run: a bar on a terminal, a line every two seconds elsewhere."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LINE_PERIOD_NS = 2_000_000_000
 
 
 class Progress:
-    """Shows elapsed time, simulation time, how fast it goes and the tracking error now, on standard error."""
+    """Shows elapsed time, simulation time, speed and the current tracking error, on standard error."""
 
     def __init__(self, duration_s: float) -> None:
         self._duration_s = duration_s
@@ -35,7 +35,7 @@ class Progress:
             self._task = self._bar.add_task("starting", total=duration_s)
 
     def update(self, t_s: float, error: tuple[float, float]) -> None:
-        """Show that simulation time is at t_s, with the largest position (m) and attitude (rad) error now."""
+        """Show simulation time t_s and the current largest position (m) and attitude (rad) error."""
         now_ns = self._clock.now_ns()
         if not self._begun_ns:
             self._begun_ns, self._line_ns, self._first_s = now_ns, now_ns, t_s
@@ -74,7 +74,7 @@ class StatusLine:
         self._width = 0
 
     def show(self, text: str) -> None:
-        """Show how things stand; call it some times a second."""
+        """Show the current state; call it several times a second."""
         if self._in_place:
             sys.stderr.write("\r" + text.ljust(self._width))
             self._width = len(text)
@@ -84,7 +84,7 @@ class StatusLine:
         sys.stderr.flush()
 
     def end(self) -> None:
-        """Leave the line, so that what follows begins on one of its own."""
+        """End the line, so that the next output begins on a new one."""
         if self._in_place and self._width:
             sys.stderr.write("\n")
             sys.stderr.flush()

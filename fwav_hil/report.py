@@ -1,4 +1,4 @@
-"""The results of a run: from its folder to summary.json, plots and a table; it can be done again at any time."""
+"""The results of a run: from its folder to summary.json, plots and a table; can be repeated at any time."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ _REFUSED = (
 def summarise(folder: Path, *, placement: str = "", budget: dict[str, Any] | None = None) -> dict[str, Any]:
     """Score the run in `folder`, write summary.json there and return it. Raises RunFolderError, ScenarioError.
 
-    `placement` and `budget` are what only the run itself knows; without them what the summary says stands.
+    `placement` and `budget` are known only to the run itself; without them the values in the summary are kept.
     """
     scenario = load_scenario(folder / FILES["scenario"])
     truth = load_truth(folder / FILES["ground_truth"])
     emulator, controller = read_json(folder / FILES["emulator"]), read_json(folder / FILES["controller"])
     before = read_json(folder / FILES["summary"])
     if not emulator and before.get("clock") == "simulated":
-        return before  # no process wrote counters here: what `simulate` knew of the run stands in its summary alone
+        return before  # no process wrote counters here: only the summary has the data of a simulation
     wall_s = emulator.get("wall_s")
     ends = {"emulator": emulator.get("counters", {}), "controller": controller.get("counters", {})}
     if motor := read_json(folder / FILES["motor"]):
@@ -91,7 +91,7 @@ def summarise(folder: Path, *, placement: str = "", budget: dict[str, Any] | Non
 
 
 def head(scenario: Scenario, truth: npt.NDArray[np.void]) -> dict[str, Any]:
-    """The keys of a summary that say which run it was."""
+    """The keys of a summary that identify the run."""
     return {
         "scenario": scenario.name,
         "law": scenario.law,

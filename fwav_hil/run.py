@@ -1,6 +1,6 @@
-"""One run: emulator and controller as two processes on a link, watched to their end, and their results put together.
+"""One run: emulator and controller as two processes on a link, watched to their end, and their results combined.
 
-The two need a second to get ready. They are started first, and what this process needs besides is loaded meanwhile.
+The two need a second to start. They are started first, and this process loads its own modules meanwhile.
 """
 
 from __future__ import annotations
@@ -39,23 +39,23 @@ class RunFailedError(FwavHilError):
 
 
 _PATIENCE = 10
-"""Looks, a tenth of a second apart or less, that a process gets to end by itself after the other one has failed."""
+"""Polls, a tenth of a second apart or less, for a process to end by itself after the other one has failed."""
 
 
 def check_link(uri: str) -> None:
-    """Raise UsageError where a controller cannot come to the emulator on this link."""
+    """Raise UsageError where a controller cannot connect to the emulator on this link."""
     if not scheme_of(uri).waits:
         raise UsageError(
-            f"`run` needs a link on which the controller can come to the emulator, and {uri} is none: use "
-            "udpin://host:port or tcpin://host:port, or start both ends by themselves"
+            f"`run` needs a link on which the emulator waits for the controller, unlike {uri}: use "
+            "udpin://host:port or tcpin://host:port, or start both ends separately"
         )
     parse_link_uri(uri)
 
 
 def check_motors(scenario: Scenario, motors: MotorLink) -> None:
-    """Raise UsageError, LinkUriError or RunFolderError where the drives' bus cannot be what is asked for.
+    """Raise UsageError, LinkUriError or RunFolderError where the options of the drives' bus cannot work.
 
-    Before anything is started, so that no folder is left behind.
+    Called before anything is started, so that no folder is left behind.
     """
     from bridge.motor_bus.can_bus import parse_can_uri
     from bridge.motor_bus.can_load import plan_bus
@@ -73,9 +73,9 @@ def check_motors(scenario: Scenario, motors: MotorLink) -> None:
 def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]:
     """Run both processes; returns the summary, which is also in the folder. Raises RunFailedError, Interrupted, ...
 
-    Before it flies, a line on standard error says how much of the delay that the gains stand is left (`budget_line`).
-    Whatever happens the folder keeps what was recorded, no process stays behind, and the summary is written if there is
-    anything to sum up.
+    Before it flies, one line on standard error shows how much of the largest stable delay is left (`budget_line`).
+    In any case the folder keeps what was recorded, no process is left running, and the summary is written if there are
+    results.
     """
     check_link(options.link)
     stop = StopFlag()
@@ -98,7 +98,7 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
     known = msgspec.to_builtins(budget)
     summary = summarise(folder, placement=placement.text, budget=known) if _has_rows(folder) else {}
     if stop.requested:
-        raise Interrupted(f"interrupted: what was recorded until then is in {folder}")
+        raise Interrupted(f"interrupted: the recording up to then is in {folder}")
     failures = [(child.failure, child.process.returncode) for child in _culprit_first(emulator, controller)]
     if keeper:
         failures.insert(0, (keeper.failure, keeper.child.process.returncode))
@@ -109,7 +109,7 @@ def run(scenario: Scenario, folder: Path, options: RunOptions) -> dict[str, Any]
 
 
 def _while_they_get_ready(scenario: Scenario, options: RunOptions) -> tuple[Budget, Progress | None]:
-    """Work out the delay budget and, unless that is the caller's, show it and make the progress bar."""
+    """Compute the delay budget and, unless the caller does so, show it and make the progress bar."""
     from fwav_hil.studies.margin import budget_line
 
     budget = budget_line(scenario, options.clock)
@@ -129,7 +129,7 @@ def _watch(
     stop: StopFlag,
     progress: Progress | None,
 ) -> None:
-    """Hear all processes until they have ended, and show how the run goes."""
+    """Read the reports of all processes until they have ended, and show the progress."""
     told = False
     patience = _PATIENCE
     children = [emulator, controller, *((keeper.child,) if keeper else ())]
@@ -146,11 +146,11 @@ def _watch(
             elif progress and child is emulator and kind == "progress":
                 progress.update(event["t_ns"] / NANOSECONDS, _error_now(scenario, event["t_ns"], event["q"]))
             elif kind in ("motors_lost", "motors_back"):
-                said = "fell silent: safe output" if kind == "motors_lost" else "are back"
+                said = "fell silent: safe output" if kind == "motors_lost" else "answer again"
                 click.echo(f"t = {event['t_ns'] / NANOSECONDS:.3f} s: the drives {said}", err=True)
             failed = any(one.process.poll() for one in (emulator, controller)) or bool(keeper and keeper.failure)
             if stop.requested or failed:
-                # What still runs ends by itself in a moment, or is asked to; signals of a terminal went to all already.
+                # A process that still runs ends by itself soon, or is asked to; a terminal's signals reached all of them.
                 patience -= 1
                 if patience == 0 or not told:
                     emulator.ask_to_end()

@@ -1,7 +1,7 @@
 """The folder of a run.
 
-scenario.toml      the scenario in full           run.tlog            every frame, both directions; run.tlog.json: its sidecar
-ground_truth.npy   one row a tick                 emulator.json, controller.json   counters of each end
+scenario.toml      the full scenario              run.tlog            every frame, both directions; run.tlog.json: its sidecar
+ground_truth.npy   one row per tick               emulator.json, controller.json   counters of each end
 summary.json       scores, latency, counters      *.png               plots
 """
 

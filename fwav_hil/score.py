@@ -12,7 +12,7 @@ from protocol.messages import AXES, FloatArray
 from protocol.scenario import NANOSECONDS, Scenario
 
 SETTLED_S = 2.0
-"""From here on the start-up transient no longer counts."""
+"""Start of the settled part: the start-up transient is over."""
 
 
 def desired_positions(scenario: Scenario, count: int) -> FloatArray:

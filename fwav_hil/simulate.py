@@ -1,7 +1,7 @@
 """The closed loop in one process, without a link: the same law, plant, sampling, noise, delays and wire mapping.
 
-A lockstep run of the two processes and this give the same numbers to the bit, since every kernel is shared and the order
-of a tick is the same: measure, as the wire carries it, law, safety envelope, command on its way, record, advance.
+A lockstep run of the two processes gives the same numbers to the bit, since every kernel is shared and the order of a
+tick is the same: measure (rounded as on the wire), law, safety envelope, queue the command, record, advance.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ def _loop(
 ) -> tuple[int, int]:
     """Run len(rows) ticks; row k is that of the ground truth at t_k. Returns (rows made, outcome).
 
-    The command of tick k acts delays_ns[k] later, but never before the one of the tick before; where that is negative it
-    never does.
+    The command of tick k acts delays_ns[k] later, but never before that of the previous tick; with a negative delay it
+    never acts.
     """
     law, law_state, plant = packed_law[0], packed_law_state[0], packed_plant[0]
     body, envelope, period_ns = parameters[0], packed_envelope[0], law.period_ns
@@ -61,7 +61,7 @@ def _loop(
 
 
 class Simulation(NamedTuple):
-    """What a run left behind.
+    """The results of a simulation.
 
     t_ns (n,), and (n, 6) each: q, q_dot true motion at t_k; command, the tau of the law (body frame); tau, what acts at the
     motors at t_k; u, after the gears. divergence: why the run ended early, or None.
@@ -88,7 +88,7 @@ def simulate(
     if delays_ns is None:
         delays_ns = np.full(scenario.ticks, scenario.delay_ns)
     if delays_ns.shape != (scenario.ticks,):
-        raise UsageError(f"delays of shape {delays_ns.shape} for {scenario.ticks} ticks: give one for each tick")
+        raise UsageError(f"delays of shape {delays_ns.shape} for {scenario.ticks} ticks: give one per tick")
     law = law or make_law(scenario.law, scenario)
     plant = Plant(scenario)
     state = law.start()

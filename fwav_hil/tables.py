@@ -15,12 +15,12 @@ DEGREES = 180.0 / math.pi
 
 
 def plain_console(*, to_stderr: bool = False, width: int | None = None) -> Console:
-    """A console that shows text as it is: in a path or a URI, `[x]` is no markup to it and `:b:` no emoji."""
+    """A console that prints text unchanged: `[x]` or `:b:` in a path or a URI is neither markup nor emoji."""
     return Console(highlight=False, markup=False, emoji=False, soft_wrap=True, stderr=to_stderr, width=width)
 
 
 def print_summary(summary: dict[str, Any], *, to_stderr: bool = False) -> None:
-    """Print the result of a run: tracking by axis, then one line each of what was counted and measured."""
+    """Print the result of a run: tracking by axis, then one line each for counters and measurements."""
     console = plain_console(to_stderr=to_stderr)
     console.print(_tracking_table(summary))
     rate, lockstep = summary["ticks_per_s"], summary["clock"] == "lockstep"
@@ -34,7 +34,7 @@ def print_summary(summary: dict[str, Any], *, to_stderr: bool = False) -> None:
         if figures.get("p50") is not None:
             shown = ", ".join(f"{key} {figures[key]:.0f} us" for key in ("p50", "p99", "max"))
             note = (
-                " (lockstep waits for every answer: its price, no latency test)"
+                " (lockstep waits for every answer, so this is not the latency of a real-time loop)"
                 if lockstep and name == "latency_us"
                 else ""
             )
@@ -45,7 +45,7 @@ def print_summary(summary: dict[str, Any], *, to_stderr: bool = False) -> None:
         bitrate = str(can["bitrate"])
         console.print(
             f"{can['protocol']} drives on {can['uri']}: {can['measured_load_percent'][bitrate]:.0f} % of "
-            f"{can['bitrate'] / 1000:g} kbit/s ({can['load_percent'][bitrate]:.0f} % reckoned at worst), "
+            f"{can['bitrate'] / 1000:g} kbit/s ({can['load_percent'][bitrate]:.0f} % computed worst case), "
             f"outages {counted['motor_outages']}, recoveries {counted['motor_recoveries']}"
         )
     if counters := summary.get("counters"):
@@ -53,7 +53,7 @@ def print_summary(summary: dict[str, Any], *, to_stderr: bool = False) -> None:
 
 
 def _print_real_time(console: Console, summary: dict[str, Any]) -> None:
-    """How late the ticks of a real-time run were, and what the system granted and refused each process."""
+    """The lateness of a real-time run's ticks, and the settings that the system granted or refused each process."""
     for end, late in (summary.get("lateness_us") or {}).items():
         if late and late["p50"] is not None:
             shown = ", ".join(f"{key} {late[key]:.1f} us" for key in ("p50", "p99", "p999", "max"))
@@ -64,7 +64,7 @@ def _print_real_time(console: Console, summary: dict[str, Any]) -> None:
             console.print(f"{end} was granted: {', '.join(granted) or 'nothing'}")
         for setting in settings:
             if not setting["granted"]:
-                remedy = f"; mend with: {setting['remedy']}" if setting["remedy"] else ""
+                remedy = f"; to fix: {setting['remedy']}" if setting["remedy"] else ""
                 console.print(f"{end} was refused: {setting['name']} ({setting['said']}{remedy})")
 
 
@@ -83,7 +83,7 @@ def _tracking_table(summary: dict[str, Any]) -> Table:
 
 
 def show_error(axis: str, value: float | None) -> str:
-    """An error in the units one thinks in: mm, degrees."""
+    """An error in mm or degrees."""
     if value is None:
         return "-"
     return f"{1e3 * value:.2f} mm" if axis in AXES[:3] else f"{DEGREES * value:.3f} deg"

@@ -21,7 +21,7 @@ def motor(
     options: MotorOptions,
     json_path: JsonPath = None,
 ) -> None:
-    """Be six simulated drives on a CAN bus, with the limits and gears of SCENARIO, for whatever controller commands them.
+    """Run six simulated drives on a CAN bus, with the limits and gears of SCENARIO, for any controller of such drives.
 
     Ctrl-C ends it.
     """

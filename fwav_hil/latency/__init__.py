@@ -1,1 +1,1 @@
-"""How late everything is: legs of the closed loop, probes of a link, other programs beside it."""
+"""Latency: segments of the closed loop, probes of a link, other programs for comparison."""

@@ -1,4 +1,4 @@
-"""From time stamps to legs: the rows of both ends joined by the sample they speak of."""
+"""From time stamps to latency segments: the rows of both ends are joined by sample time."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ LEGS = {
     "apply": "-> applied",
     "age": "age: stamped -> applied",
 }
-"""Each leg by name, in the order of travel; `age` is that of the sample in the applied command."""
+"""Each latency segment by name, in the order of travel; `age` is that of the sample in the applied command."""
 
 
 class Legs(NamedTuple):
-    """What the stamps of a run say.
+    """The latency segments of a run.
 
     t_ns (n,)      simulation time of the samples that were answered
-    durations_ns   leg -> (n,) ns; a leg that is not known for a sample is -1 there
+    durations_ns   segment -> (n,) ns; -1 where it is not known for a sample
     delay_ns (n,)  from the sample to the action of its command, in simulation time
-    clock          TIMESYNC's estimate of the controller's clock less the emulator's, None where nobody answered
-    negative       durations that came out negative and count as 0: so much for the clocks
-    offset_ns      of two clocks: the controller's less the emulator's at each sample, and the bound of its error (n,) each;
-    offset_error_ns    None where there is one clock, or where nobody answered
+    clock          TIMESYNC's estimate of the controller's clock minus the emulator's, None without an answer
+    negative       number of negative durations, which count as 0: a measure of clock error
+    offset_ns      with two clocks: the controller's minus the emulator's at each sample, and the bound of its error (n,) each;
+    offset_error_ns    None with one clock, or without an answer
     """
 
     t_ns: Rows
@@ -56,13 +56,13 @@ class Legs(NamedTuple):
     offset_error_ns: Rows | None = None
 
     def known(self, leg: str) -> Rows:
-        """The durations of a leg, those that are known."""
+        """The known durations of a segment."""
         values = self.durations_ns[leg]
         return values[values >= 0]
 
 
 def join_legs(folder: Path, controller_folder: Path | None = None) -> Legs:
-    """The legs of a run: on one machine with one clock, with a controller_folder with two, related by TIMESYNC.
+    """The segments of a run: with one clock on one machine; with a controller_folder two clocks, related by TIMESYNC.
 
     Raises RunFolderError.
     """
@@ -75,10 +75,10 @@ def join_legs(folder: Path, controller_folder: Path | None = None) -> Legs:
 
 
 def legs_of(ticks: Rows, answers: Rows, samples: Rows, clock: Estimate | None, *, clocks: Rows | None = None) -> Legs:
-    """The legs of rows as `bridge.latency.segments` describes them; samples whose command was never applied are left out.
+    """The segments of rows as in `bridge.latency.segments`; samples whose command was never applied are left out.
 
-    clocks: where the ends have two, how they relate (CLOCK_COLUMNS); without a row nobody knows, and with it no leg from one
-    end to the other.
+    clocks: with two clocks, rows that relate them (CLOCK_COLUMNS); without a row, segments from one end to the other are
+    unknown.
     """
     t_ns = np.intersect1d(np.intersect1d(ticks[:, 0], answers[:, 0]), samples[:, 0])
     tick = _columns(ticks, t_ns, TICK_COLUMNS)
@@ -111,7 +111,7 @@ def legs_of(ticks: Rows, answers: Rows, samples: Rows, clock: Estimate | None, *
 
 
 def _shifted(stamps_ns: Rows, offset_ns: Rows | None) -> Rows:
-    """Stamps of the controller on the emulator's clock; those that are not known stay 0."""
+    """Time stamps of the controller converted to the emulator's clock; unknown ones stay 0."""
     return stamps_ns if offset_ns is None else np.where(stamps_ns != 0, stamps_ns - offset_ns, 0)
 
 
@@ -124,7 +124,7 @@ def _columns(rows: Rows, t_ns: Rows, names: tuple[str, ...]) -> dict[str, npt.ND
 
 
 def clock_check(legs: Legs) -> dict[str, Any] | None:
-    """TIMESYNC against the clock that both ends share on one machine: its error beside its bound; us."""
+    """TIMESYNC compared with the clock that both ends share on one machine: its error and its bound; us."""
     if legs.clock is None:
         return None
     return {

@@ -1,4 +1,4 @@
-"""Two clocks that drift: how far one is ahead of the other at any time, from the answers to TIMESYNC."""
+"""The offset between two drifting clocks over time, from the answers to TIMESYNC."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ MOST_DRIFT = 1e-4
 def offset_at(clocks: Rows, at_ns: Rows) -> tuple[Rows, Rows]:
     """(offset, bound of its error), ns, (n,) each, at the times at_ns; clocks: rows of CLOCK_COLUMNS, one at least.
 
-    An answer is wrong by half its round trip at most, and by MOST_DRIFT of the time that lies between: the one for which the
-    sum is least is believed.
+    The error of an answer is at most half its round trip, plus MOST_DRIFT times the time since or until it: the answer with the
+    smallest sum is used.
     """
     rows = clocks[np.argsort(clocks[:, 0], kind="stable")]
     start_ns = rows[0, 0]
     t, t_answers = (at_ns - start_ns).astype(float), (rows[:, 0] - start_ns).astype(float)
     error, number = rows[:, 2] / 2.0, np.arange(len(rows))
-    # Of all answers before a time the same one is best at any later time, and likewise after: a running minimum finds it.
+    # The best of all answers before a time stays the best at any later time, and vice versa: a running minimum finds it.
     earlier = _running_best(error - MOST_DRIFT * t_answers)
     later = number[::-1][_running_best((error + MOST_DRIFT * t_answers)[::-1])][::-1]
     place = np.searchsorted(t_answers, t, side="right")
@@ -32,6 +32,6 @@ def offset_at(clocks: Rows, at_ns: Rows) -> tuple[Rows, Rows]:
 
 
 def _running_best(cost: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """At each place the index of the least so far."""
+    """At each place the index of the smallest value so far."""
     is_best = cost == np.minimum.accumulate(cost)
     return np.maximum.accumulate(np.where(is_best, np.arange(len(cost)), 0))

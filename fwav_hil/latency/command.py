@@ -37,12 +37,12 @@ def latency(
     choice: ScenarioChoice,
     link: Annotated[str, Option(
         "--link",
-        "udpin:// or tcpin://: fly the closed loop on it. Any other link: ask whoever is there, by TIMESYNC.", "URI"
+        "udpin:// or tcpin://: fly the closed loop on it. Any other link: probe the peer there by TIMESYNC.", "URI"
     )] = FREE_PORT,
     delay_ns: DelayNs = 0,
     realtime: RealTime = False,
     against: Annotated[
-        bool, Option("--against", "Measure a bare UDP echo, a mavutil script and cyclictest beside it.")
+        bool, Option("--against", "Also measure a bare UDP echo, a mavutil script and cyclictest, for comparison.")
     ] = False,
     folder: Annotated[Path | None, Option(
         "--from", "Fly nothing: report the run in this folder, flown with --legs.", "DIR", type=EXISTING_FOLDER
@@ -54,14 +54,14 @@ def latency(
     out: Annotated[
         Path | None,
         folder_option(
-            "Folder of the run, its histograms (.hgrm) and the plot; by default a new one in runs/. With --from: of "
-            "histograms and plot, instead of the run's own."
+            "Folder of the run, its histograms (.hgrm) and the plot; by default a new one in runs/. With --from: for "
+            "histograms and plot only, instead of the run's folder."
         ),
     ] = None,
     wait_s: WaitS = 30.0,
     json_path: JsonPath = None,
 ) -> None:  # fmt: skip
-    """Measure where the time goes between a sample and its command, in the real-time closed loop or on a real link."""
+    """Measure each latency segment between a sample and its command, in the real-time closed loop or on a real link."""
     from fwav_hil.tables import plain_console
 
     require("plots", "studies")
@@ -72,12 +72,12 @@ def latency(
         _refuse_others("with --from nothing is flown", "--from", "--controller-from", "--out", "--json")
         if out:
             if (out / RESULT).exists():
-                raise RunFolderError(f"{out} holds a latency report already, which stays: choose another with --out")
+                raise RunFolderError(f"{out} already holds a latency report: choose another folder with --out")
             make_folder(out)
         _report(folder, controller_folder, None, console, json_path, out=out)
         return
     if not scheme_of(link).waits:
-        asked = f"whoever is at {link} is asked by TIMESYNC alone"
+        asked = f"the peer at {link} is probed by TIMESYNC only"
         _refuse_others(asked, "--link", "--rate", "--duration", "--wait", "--json")
         rate_hz = _ASKED_RATE_HZ if choice.rate_hz is None else choice.rate_hz
         seconds = _ASKED_S if choice.duration_s is None else choice.duration_s
@@ -98,7 +98,7 @@ def latency(
     try:
         closed_loop(scenario, folder, link=link, delay_ns=delay_ns, wait_s=wait_s, realtime=realtime)
     except FwavHilError:
-        # The run's own error is the one to end with; what there is of it is reported all the same.
+        # The run's own error is raised; its results so far are reported all the same.
         with contextlib.suppress(FwavHilError):
             _report(folder, None, {}, console, json_path)
         raise
@@ -109,16 +109,16 @@ def latency(
             found = beside(scenario.rate_hz, min(LONGEST_PROBING_S, scenario.duration_s), stop, told, against=against)
     except Interrupted:
         raise Interrupted(
-            f"interrupted after the run, which is in {folder}: `fwav-hil latency --from {folder}` reports it"
+            f"interrupted after the run; it is in {folder}: show it with `fwav-hil latency --from {folder}`"
         ) from None
     _report(folder, None, found, console, json_path)
 
 
 def _refuse_others(why: str, *known: str) -> None:
-    """Raise UsageError where an argument was given that would do nothing."""
+    """Raise UsageError where an argument was given that would have no effect."""
     for flag in given_options():
         if flag not in known:
-            raise UsageError(f"{why}, so {flag} would do nothing: leave it out")
+            raise UsageError(f"{why}, so {flag} has no effect: leave it out")
 
 
 def _report(
@@ -130,8 +130,8 @@ def _report(
     *,
     out: Path | None = None,
 ) -> None:
-    """Show what the time stamps in a run folder say, beside what else was found (None: when it was flown), and write it
-    to `out`, or beside them.
+    """Show the latency of the run in a folder, with the comparisons found (None: those made when it was flown), and write it
+    to `out`, or to that folder.
     """
     from fwav_hil.latency.analysis import LEGS, join_legs
     from fwav_hil.latency.figures import draw
@@ -149,7 +149,7 @@ def _report(
     durations = {name: legs.known(name) for name in LEGS}
     files = write_files(target, durations)
     known = legs.durations_ns["age"] >= 0
-    title = f"{scenario.name}, {scenario.law}, {scenario.rate_hz:g} Hz, real time: legs of the loop"
+    title = f"{scenario.name}, {scenario.law}, {scenario.rate_hz:g} Hz, real time: latency segments of the loop"
     series = (legs.t_ns[known] * 1e-9, "age of the sample in the applied command", legs.durations_ns["age"][known])
     files["plot"] = str(draw(target / "latency.png", title, durations, series))
     result = {"mode": "closed_loop", **report, "beside": found, "files": {**files, "run": str(folder)}}
@@ -160,7 +160,7 @@ def _report(
 
 
 def _ask(uri: str, rate_hz: float, seconds: float, wait_s: float, console: Console, json_path: Path | None) -> None:
-    """Probe whoever is at the link by TIMESYNC. Raises UsageError, what the link raises, PeerMissingError, Interrupted."""
+    """Probe the peer on the link by TIMESYNC. Raises UsageError, the link's errors, PeerMissingError, Interrupted."""
     from bridge.process import StopFlag, open_patiently
     from fwav_hil.latency.histogram import percentiles
     from fwav_hil.latency.peers import probe_time_sync
@@ -169,8 +169,8 @@ def _ask(uri: str, rate_hz: float, seconds: float, wait_s: float, console: Conso
     count = rate_hz * seconds
     if not (0.0 < rate_hz <= _MOST_HZ and 1.0 <= count <= _MOST_QUESTIONS):
         raise UsageError(
-            f"{rate_hz:g} questions a second for {seconds:g} s cannot be asked: --rate is up to {_MOST_HZ:g}, and --rate times "
-            f"--duration from 1 to {_MOST_QUESTIONS:g}"
+            f"{rate_hz:g} TIMESYNC requests a second for {seconds:g} s are out of range: --rate is at most {_MOST_HZ:g}, and "
+            f"--rate times --duration from 1 to {_MOST_QUESTIONS:g}"
         )
     count = round(count)
     stop = StopFlag()
@@ -178,11 +178,11 @@ def _ask(uri: str, rate_hz: float, seconds: float, wait_s: float, console: Conso
     with open_patiently(uri, wait_s, stop) as link, _Bar() as told:
         link.stamp_receives()
         result, clock = probe_time_sync(
-            link, stop, rate_hz=rate_hz, count=count, told=lambda sent: told("asking", sent / count)
+            link, stop, rate_hz=rate_hz, count=count, told=lambda sent: told("probing", sent / count)
         )
     if clock is None:
         raise PeerMissingError(
-            f"nobody at {uri} answered any of {count} TIMESYNC questions: see that an autopilot is there and speaks MAVLink 2"
+            f"no answer from {uri} to {count} TIMESYNC requests: check that an autopilot is there and uses MAVLink 2"
         )
     shown = {
         "mode": "time_sync",
@@ -202,7 +202,7 @@ def _ask(uri: str, rate_hz: float, seconds: float, wait_s: float, console: Conso
 
 
 class _Bar:
-    """A progress bar on a terminal; gives a function of what is done and which share of it."""
+    """A progress bar on a terminal; yields a function that takes the current step and its share done."""
 
     def __enter__(self) -> Callable[[str, float], None]:
         from rich.console import Console

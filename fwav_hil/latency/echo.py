@@ -1,4 +1,4 @@
-"""The bare anchor: a UDP echo in the standard library alone, of the sizes of a tick and its command.
+"""The baseline: a UDP echo with the standard library only, with datagrams of the sizes of a tick and its command.
 
 `python -m fwav_hil.latency.echo` writes its port, then answers each datagram with its first 93 bytes; it ends with its parent.
 """

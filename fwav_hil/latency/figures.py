@@ -31,7 +31,7 @@ def draw(
     for number, (name, values) in enumerate(curves.items()):
         ordered = np.sort(values) / 1e3
         if not ordered.any():
-            continue  # nothing, or nothing but zeros, for which a logarithmic axis has no place
+            continue  # nothing, or zeros only, which a logarithmic axis cannot show
         share = (np.arange(len(ordered)) + 0.5) / len(ordered)
         style = {"color": COLOURS[number % len(COLOURS)], "linestyle": STYLES[number // len(COLOURS) % len(STYLES)]}
         left.plot(1.0 / (1.0 - share), ordered, linewidth=1.3, label=name, **style)

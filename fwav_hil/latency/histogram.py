@@ -27,7 +27,7 @@ def histogram_of(durations_ns: npt.NDArray[np.int64]) -> Any:
 
 
 def percentiles(durations_ns: npt.NDArray[np.int64]) -> dict[str, float | int | None]:
-    """count, p50 to p9999 and max, in microseconds; None each where there is nothing to count."""
+    """count, p50 to p9999 and max, in microseconds; None each where there are no values."""
     if not len(durations_ns):
         return {"count": 0, **dict.fromkeys((*PERCENTILES, "max"))}
     histogram = histogram_of(durations_ns)

@@ -1,4 +1,4 @@
-"""Open-loop probes of one link: our own responder, a bare echo, a mavutil script, or whatever autopilot is there."""
+"""Open-loop probes of one link: our own responder, a bare echo, a mavutil script, or an autopilot."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Told = Callable[[int], None]
 def probe_time_sync(
     link: Link, stop: StopFlag, *, rate_hz: float, count: int, told: Told
 ) -> tuple[ProbeResult, Estimate | None]:
-    """TIMESYNC questions as a ground station asks them; with the other clock's offset by the quickest answer."""
+    """TIMESYNC requests as a ground station sends them; with the other clock's offset from the fastest answer."""
     clock = MonotonicClock()
     endpoint = Endpoint(link, *GROUND_STATION)
     numbers: dict[int, int] = {}
@@ -51,9 +51,9 @@ def probe_time_sync(
         found = []
         for frame in endpoint.reader.read(data):
             if frame.message_id != mapping.TIMESYNC.message_id or (frame.system, frame.component) == GROUND_STATION:
-                continue  # a line that gives back what is sent knows no time
+                continue  # our own request, echoed by the line
             answer_ns, asked_ns = mapping.decode_timesync(frame.payload)
-            if answer_ns == 0:  # the other end asks too
+            if answer_ns == 0:  # a request of the other end
                 reply = others.handle(frame, arrived_ns)
                 if reply:
                     link.send(reply)
@@ -81,7 +81,7 @@ def probe_time_sync(
 
 
 def probe_responder(stop: StopFlag, *, rate_hz: float, count: int, told: Told) -> ProbeResult:
-    """TIMESYNC between two processes of ours over UDP."""
+    """TIMESYNC between two of our processes over UDP."""
     with (
         _child("bridge.latency.responder", "udpin://127.0.0.1:0") as said,
         open_link(counterpart(said)) as link,
@@ -91,7 +91,7 @@ def probe_responder(stop: StopFlag, *, rate_hz: float, count: int, told: Told) -
 
 
 def probe_echo(stop: StopFlag, *, rate_hz: float, count: int, told: Told) -> ProbeResult:
-    """A bare UDP echo: a tick's bytes there, a command's back."""
+    """A bare UDP echo: the bytes of a tick out, those of a command back."""
 
     def question(number: int) -> bytes:
         return number.to_bytes(8, "little").ljust(TICK_BYTES, b"x")
@@ -103,7 +103,7 @@ def probe_echo(stop: StopFlag, *, rate_hz: float, count: int, told: Told) -> Pro
 
 
 def probe_mavutil(stop: StopFlag, *, rate_hz: float, count: int, told: Told) -> ProbeResult:
-    """Pose and tick there, HIL_ACTUATOR_CONTROLS back, by a mavutil script at the other end."""
+    """Pose and tick out, HIL_ACTUATOR_CONTROLS back, by a mavutil script at the other end."""
     period_ns = round(1e9 / rate_hz)
     writer, reader = FrameWriter(*EMULATOR), FrameReader(is_datagram=True)
     q, readings = np.zeros(6), np.zeros(13)
@@ -143,9 +143,9 @@ def _probe_port(
 
 @contextmanager
 def _child(module: str, *arguments: str) -> Iterator[str]:
-    """A module of ours as a process; gives the first line it writes, and ends it.
+    """One of our modules as a process; yields the first line it writes, and ends it.
 
-    It has a session of its own: a Ctrl-C is for us alone, and we end it.
+    It has a session of its own: a Ctrl-C reaches this process only, which then ends it.
     """
     process = subprocess.Popen(
         [sys.executable, "-m", module, *arguments], stdout=subprocess.PIPE, text=True, start_new_session=True
@@ -153,7 +153,7 @@ def _child(module: str, *arguments: str) -> Iterator[str]:
     try:
         line = process.stdout.readline().strip() if process.stdout else ""
         if not line:
-            raise PeerMissingError(f"the process `python -m {module}` did not start: run it by itself to see why")
+            raise PeerMissingError(f"the process `python -m {module}` did not start: run it alone to see why")
         yield line
     finally:
         process.kill()
@@ -161,10 +161,10 @@ def _child(module: str, *arguments: str) -> Iterator[str]:
 
 
 def cyclictest(stop: StopFlag, *, rate_hz: float, seconds: float, told: Told) -> npt.NDArray[np.int64] | None:
-    """Wake-up lateness of cyclictest (Debian rt-tests), ns, whole microseconds; None where it is not installed or refuses.
+    """Wake-up lateness of cyclictest (Debian rt-tests), ns, whole microseconds; None where it is not installed or fails.
 
-    It runs at the period of rate_hz, without asking for a priority or for quick idle states: as an ordinary process, like
-    ours. `told` hears the loops that should be done by now. Raises Interrupted.
+    It runs at the period of rate_hz, without real-time priority and without limiting idle states: an ordinary process, like
+    ours. `told` is called with the number of loops expected so far. Raises Interrupted.
     """
     program = shutil.which("cyclictest") or ("/usr/sbin/cyclictest" if Path("/usr/sbin/cyclictest").exists() else None)
     if program is None:
@@ -199,7 +199,7 @@ def cyclictest(stop: StopFlag, *, rate_hz: float, seconds: float, told: Told) ->
 
 
 def lateness_of(said: str) -> npt.NDArray[np.int64] | None:
-    """Lateness (n,) ns in the histogram that cyclictest printed; what did not fit into it counts as its maximum."""
+    """Lateness (n,) ns from the histogram that cyclictest printed; values beyond it count as its maximum."""
     values, counts = [], []
     for line in said.splitlines():
         if found := re.fullmatch(r"(\d+)\s+(\d+)", line.strip()):

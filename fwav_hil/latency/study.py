@@ -1,4 +1,4 @@
-"""One latency study: the closed loop in real time, probes beside it, and what simulation says of the delay found."""
+"""One latency study: the closed loop in real time, probes for comparison, and a simulation with the delay found."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from plant_emulator.options import EmulatorOptions
 from protocol.scenario import NANOSECONDS, Delay, Scenario
 
 Told = Callable[[str, float], None]
-"""Hears what is being done, and the share of it that is done."""
+"""Called with the current step and the share of it that is done."""
 
 LONGEST_PROBING_S = 5.0
-MISSING_CYCLICTEST = "cyclictest was not found or refused to run: install it with `apt-get install rt-tests`"
+MISSING_CYCLICTEST = "cyclictest was not found or failed: install it with `apt-get install rt-tests`"
 
 
 def closed_loop(
@@ -41,7 +41,7 @@ def closed_loop(
 
 
 def leg_report(legs: Legs) -> dict[str, dict[str, float | int | None]]:
-    """Percentiles of every leg, us."""
+    """Percentiles of every latency segment, us."""
     return {name: percentiles(legs.known(name)) for name in LEGS}
 
 
@@ -57,10 +57,10 @@ def write_files(folder: Path, durations_ns: dict[str, npt.NDArray[np.int64]]) ->
 
 
 def losses(summary: dict[str, Any]) -> dict[str, int]:
-    """What went missing or wrong on the way, of both ends, from the counters of a run.
+    """Lost, duplicate and reordered frames of both directions, from the counters of a run.
 
-    Where no sample comes in time the controller gives its last answer again, the same frame (`repeated`): that is no
-    duplicate of the link, and not out of order.
+    Where no sample arrives in time the controller sends its last answer again, the same frame (`repeated`): this is not a
+    duplicate made by the link, and not out of order.
     """
     counters = summary.get("counters", {})
     emulator, controller = counters.get("emulator", {}), counters.get("controller", {})
@@ -77,10 +77,10 @@ def losses(summary: dict[str, Any]) -> dict[str, int]:
 
 
 def prediction(scenario: Scenario, legs: Legs, summary: dict[str, Any]) -> dict[str, Any] | None:
-    """The tracking error that `simulate` predicts, beside the run's: RMSE by axis.
+    """The tracking error that `simulate` predicts, and the run's: RMSE by axis.
 
     `constant`: every command delayed by the median age. `recorded`: each by its own delay in the run, in simulation time;
-    a command that did not come never acts. Both are as long as the run was. None of a simulation that diverged.
+    a command that did not arrive never acts. Both are as long as the run was. None where a simulation diverged.
     """
     flown = np.arange(summary.get("ticks", 0)) * scenario.period_ns
     answered = np.isin(legs.t_ns, flown)
@@ -109,8 +109,8 @@ def _rmse(scenario: Scenario, result: Simulation) -> dict[str, float | None] | N
 def beside(rate_hz: float, seconds: float, stop: StopFlag, told: Told, *, against: bool) -> dict[str, Any]:
     """Open-loop probes of our own responder and, if asked, of a bare echo and a mavutil script; and cyclictest's wake-ups.
 
-    Values are distributions in us, with the answers lost, doubled, out of order and to no question; a note where one could
-    not run. Raises Interrupted.
+    Values are distributions in us, with the counts of answers lost, duplicate, out of order and unrequested; a note where a
+    probe could not run. Raises Interrupted.
     """
     count = max(100, round(rate_hz * seconds))
     probes = {"open_loop": probe_responder}
@@ -137,7 +137,7 @@ def beside(rate_hz: float, seconds: float, stop: StopFlag, told: Told, *, agains
 
 
 def summary_of(folder: Path, controller_folder: Path | None = None) -> dict[str, Any]:
-    """The summary of a run folder, made where there is none yet (an emulator alone writes none), with the counters of both.
+    """The summary of a run folder, computed where there is none (an emulator alone writes none), with the counters of both.
 
     Raises RunFolderError, ScenarioError.
     """
@@ -149,7 +149,7 @@ def summary_of(folder: Path, controller_folder: Path | None = None) -> dict[str,
 
 
 def report_of(scenario: Scenario, summary: dict[str, Any], legs: Legs, *, two_clocks: bool = False) -> dict[str, Any]:
-    """The report of a run with time stamps; two_clocks: TIMESYNC joined its legs, and there is nothing to check it by."""
+    """The report of a run with time stamps; two_clocks: TIMESYNC relates the clocks, with no shared clock to check it."""
     return {
         "scenario": scenario.name,
         "law": scenario.law,
@@ -165,7 +165,7 @@ def report_of(scenario: Scenario, summary: dict[str, Any], legs: Legs, *, two_cl
 
 
 def _offset_of(legs: Legs) -> dict[str, Any] | None:
-    """How far the controller's clock is ahead at the first sample and at the last, and the largest bound of the error; us."""
+    """The offset of the controller's clock at the first and last sample, and the largest bound of its error; us."""
     if legs.clock is None or legs.offset_ns is None or legs.offset_error_ns is None or not len(legs.t_ns):
         return None
     return {

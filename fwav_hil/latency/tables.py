@@ -18,28 +18,26 @@ HEADINGS = ("50 %", "90 %", "99 %", "99.9 %", "99.99 %", "max")
 
 
 def print_report(result: dict[str, Any], console: Console) -> None:
-    """A closed-loop study: legs, losses, what stood beside it, the prediction."""
+    """A closed-loop study: latency segments, losses, comparisons, the prediction."""
     title = f"{result['scenario']}, law {result['law']}, {result['rate_hz']:g} Hz, real time; us"
     console.print(_table(title, {LEGS[name]: figures for name, figures in result["legs_us"].items()}))
     console.print(", ".join(f"{name.replace('_', ' ')} {count}" for name, count in result["losses"].items()))
     if result["negative_legs"]:
-        console.print(
-            f"{result['negative_legs']} durations came out negative and count as 0: the clocks are that uncertain"
-        )
+        console.print(f"{result['negative_legs']} durations were negative and count as 0, because of clock error")
     sync = result["time_sync"]
     if sync is None:
-        console.print("TIMESYNC: no answer came; where the ends have two clocks, the legs between them are not known")
+        console.print("TIMESYNC: no answer; where the ends have two clocks, the latency between them is unknown")
     elif "error_us" in sync:
         judged = "within" if sync["held"] else "BEYOND"
         console.print(
-            f"TIMESYNC: offset off by {sync['error_us']:.1f} us from the shared clock, {judged} its bound of "
+            f"TIMESYNC: offset wrong by {sync['error_us']:.1f} us against the shared clock, {judged} its bound of "
             f"{sync['bound_us']:.1f} us (half the round trip), {sync['answers']} answers"
         )
     else:
         console.print(
             f"TIMESYNC: the controller's clock is ahead by {sync['offset_us']:.1f} us at the start and "
-            f"{sync['offset_at_end_us']:.1f} us at the end, within {sync['bound_us']:.1f} us; legs between the machines are "
-            "that uncertain"
+            f"{sync['offset_at_end_us']:.1f} us at the end, within {sync['bound_us']:.1f} us; latencies between the machines "
+            "have the same uncertainty"
         )
     if beside := result["beside"]:
         rows = {
@@ -49,7 +47,7 @@ def print_report(result: dict[str, Any], console: Console) -> None:
         }
         if "wake" in beside.get("cyclictest", {}):
             rows["wake-up, cyclictest"] = beside["cyclictest"]["wake"]
-        console.print(_table("beside it, one after the other, each from when it was due; us", rows))
+        console.print(_table("for comparison, measured one after the other, each from its due time; us", rows))
         for name, found in beside.items():
             gone = {key: found[key] for key in ("lost", "duplicate", "out_of_order", "unknown") if found.get(key)}
             if gone:
@@ -74,7 +72,7 @@ def print_probes(result: dict[str, Any], console: Console) -> None:
     console.print(_table(f"TIMESYNC on {result['link']} at {result['rate_hz']:g} Hz; us", rows))
     console.print(
         f"lost {result['lost']}, duplicate {result['duplicate']}, out of order {result['out_of_order']}, "
-        f"to no question {result['unknown']}"
+        f"unrequested {result['unknown']}"
     )
     console.print(
         f"the other clock is ahead by {result['clock_offset_us']:.1f} us, within {result['clock_offset_bound_us']:.1f} us"

@@ -1,1 +1,1 @@
-"""Logs replayed: to a link in time, into a controller or an emulator with a comparison; and two logs compared."""
+"""Replay of logs to a link, or into a controller or an emulator with a comparison; comparison of two logs."""

@@ -18,7 +18,7 @@ from fwav_hil.replay.options import TO, IntoOptions, ReplayOptions
 from protocol.errors import Interrupted, RunFolderError, UsageError
 
 DIFFERENT = 1
-"""Exit code where a replay, or the other log, differs."""
+"""Exit code where a replay, or a compared log, differs."""
 
 
 @command(
@@ -37,14 +37,14 @@ def replay_command(
     )] = (),
     into: Annotated[Literal["controller", "emulator"] | None, Option(
         "--into",
-        "Give a controller the recorded samples, or a plant the recorded commands, and compare what comes of it."
+        "Send a controller the recorded samples, or a plant the recorded commands, and compare the results."
     )] = None,
     begin: Annotated[str | None, Option(
         "--from", "Where to begin: seconds since the log began, or HH:MM:SS (UTC).", "TIME", only_with=TO
     )] = None,
-    types: Annotated[tuple[str, ...], Option("--types", "Only these messages.", "NAME,...", only_with=TO)] = (),
+    types: Annotated[tuple[str, ...], Option("--types", "Send only these messages.", "NAME,...", only_with=TO)] = (),
     systems: Annotated[
-        tuple[str, ...], Option("--system", "Only what these sent.", "ID[/COMPONENT]", only_with=TO)
+        tuple[str, ...], Option("--system", "Send only frames of these senders.", "ID[/COMPONENT]", only_with=TO)
     ] = (),
     dialect: Dialect = None,
     options: ReplayOptions,
@@ -53,23 +53,19 @@ def replay_command(
 ) -> int:  # fmt: skip
     """Replay LOG (a telemetry log, or a run folder): to a link, or into a controller or an emulator; a CAN log to a bus.
 
-    To a link, on a terminal: space holds and goes on, n sends one frame, the arrow keys seek, q ends.
+    To a link, on a terminal: space pauses and resumes, n sends one frame, the arrow keys seek, q ends.
 
     \b
-    Exit codes with --into: 0 no difference, 1 a difference; others as ever.
+    Exit codes with --into: 0 no difference, 1 a difference; others as for every command.
     """
     uris = [target for target in targets if "://" in target or target.startswith("can:")]
     ends = [target for target in targets if target not in uris]
     if len(uris) > 1 or len(ends) > 1 or (len(uris) == 1) == (into is not None):
-        raise UsageError(
-            "say where to replay once: --to URI (and --to TIME for the end), or --into controller|emulator"
-        )
+        raise UsageError("give one target: --to URI (and --to TIME for the end), or --into controller|emulator")
     if into and ends:
-        raise UsageError("--to TIME does nothing without --to URI: add that, or leave --to TIME out")
+        raise UsageError("--to TIME has no effect without --to URI: add that, or leave --to TIME out")
     if options.realtime and (into or options.speed is None):
-        raise UsageError(
-            "--realtime is about keeping the time of a log on its way to a link: leave out --into, --speed max"
-        )
+        raise UsageError("--realtime applies only to a timed replay to a link: leave out --into and --speed max")
     if into:
         return _replay_into(log, into, into_options, options.wait_s, json_path)
     if uris[0].startswith("can:"):
@@ -156,6 +152,6 @@ def _report_folder(out: Path | None, name: str) -> Path:
 
     folder = out or Path("runs") / f"{name}-{local_stamp()}"
     if (folder / "difference.json").exists():
-        raise RunFolderError(f"{folder} holds a report already, which stays: choose another folder with --out")
+        raise RunFolderError(f"{folder} already holds a report: choose another folder with --out")
     make_folder(folder)
     return folder

@@ -28,7 +28,7 @@ def diff_command(
     first: ExistingLog,
     second: ExistingLog,
     tolerances: Annotated[tuple[str, ...], Option(
-        "--tolerance", "What a field (FIELD, or MESSAGE.FIELD) may differ by; without FIELD, all others. Default: 0.",
+        "--tolerance", "Allowed difference of a field (FIELD, or MESSAGE.FIELD); without FIELD, of all others. Default: 0.",
         "[FIELD=]VALUE"
     )] = (),
     types: Annotated[tuple[str, ...], Option("--types", "Compare only these messages.", "NAME,...")] = (),
@@ -38,7 +38,7 @@ def diff_command(
     """Compare two logs (or run folders): rows are paired by the sample time that their messages carry.
 
     \b
-    Exit codes: 0 the same within the tolerances, 1 different; others as ever.
+    Exit codes: 0 the same within the tolerances, 1 different; others as for every command.
     """
     from fwav_hil.logs.choice import held_names, names_in, open_telemetry
     from fwav_hil.replay.command import DIFFERENT
@@ -74,7 +74,7 @@ def _print(difference: LogDifference, *, to_stderr: bool) -> None:
             table.add_row(f"{f.message}.{f.field}", f.sender, *numbers)
         console.print(table)
         if len(beyond) > _SHOWN_ROWS:
-            console.print(f"and {len(beyond) - _SHOWN_ROWS} fields more (--json holds all)")
+            console.print(f"and {len(beyond) - _SHOWN_ROWS} more fields (--json has all)")
     for name, rows in (("first", difference.only_first), ("second", difference.only_second)):
         for what, count in rows.items():
             console.print(f"only in the {name}: {count} of {what}")

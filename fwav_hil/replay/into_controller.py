@@ -1,4 +1,4 @@
-"""The recorded samples given to a controller once more, and its commands set beside the recorded ones."""
+"""Replay the recorded samples into a controller and compare its commands with the recorded ones."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ _LINK = "udpin://127.0.0.1:0"
 
 
 class _RecordedSession:
-    """Armed as the recorded controller was; nothing but commands is said."""
+    """Armed as the recorded controller was; sends only commands."""
 
     armed = False
 
     def hear(self, frame: Frame) -> None:
-        """Leave out what carries no pose."""
+        """Ignore frames without a pose."""
 
     def due_frames(self, _t_ns: int) -> list[bytes]:
-        """Nothing."""
+        """No other frames."""
         return []
 
 
 def replay_in_process(run: Recorded) -> Difference:
-    """Let the controller's tick answer the samples, in this process. Raises UsageError for state feedback."""
+    """Let the controller's `Tick` answer the samples, in this process. Raises UsageError for state feedback."""
     refuse_on_a_link(run.scenario)
     law = make_law(run.scenario.law, run.scenario)
     session, answers = _RecordedSession(), dict[int, bytes]()
@@ -61,7 +61,7 @@ def replay_in_process(run: Recorded) -> Difference:
     scenario = run.scenario
     for tick in run.ticks:
         if (gains := followed(scenario, tick.parameters)) is not scenario:
-            scenario = gains  # set while disarmed: the law starts again with them
+            scenario = gains  # set while disarmed: the law restarts with them
             law.adopt(make_law(law.name, gains))
         recorded = run.commands.get(tick.t_ns)
         session.armed = recorded is None or is_armed(recorded)
@@ -70,7 +70,7 @@ def replay_in_process(run: Recorded) -> Difference:
 
 
 def replay_into_process(run: Recorded, wait_s: float, stop: StopFlag) -> Difference:
-    """Start a controller process and give it the samples over a link, one for each answer.
+    """Start a controller process and send it the samples over a link, one for each answer.
 
     Raises UsageError for state feedback, LinkError, PeerError and Interrupted.
     """
@@ -84,7 +84,7 @@ def replay_into_process(run: Recorded, wait_s: float, stop: StopFlag) -> Differe
 
 
 def ask_controller(run: Recorded, link: Link, wait_s: float, stop: StopFlag) -> dict[int, bytes]:
-    """Be the emulator that was recorded; returns the payload of each command by the time of its sample (ns).
+    """Act as the recorded emulator; returns the payload of each command by the time of its sample (ns).
 
     Raises PeerError, LinkError and Interrupted.
     """
@@ -113,13 +113,13 @@ def _answer(endpoint: Endpoint, tick: recorded_run.Tick) -> bytes:
                 ):
                     return payload
     raise PeerLostError(
-        f"the controller gave no answer to the recorded sample at t = {tick.t_ns * 1e-9:.3f} s for 2 s: "
-        "see whether the scenario is the one of the log"
+        f"the controller did not answer the recorded sample at t = {tick.t_ns * 1e-9:.3f} s within 2 s: "
+        "check that the scenario is the log's"
     )
 
 
 def compare_commands(run: Recorded, answers: Mapping[int, bytes]) -> Difference:
-    """The recorded commands and those of a replay, by the time of their sample: every byte of the payload counts."""
+    """The recorded commands and those of a replay, by sample time: every byte of the payload is compared."""
     both = sorted(run.commands.keys() & answers.keys())
     scale = np.array(run.scenario.actuators.scale)
     size = mapping.COMMAND.size

@@ -1,4 +1,4 @@
-"""The recorded commands given to the plant once more, and its motion set beside the recorded one."""
+"""Replay the recorded commands into the plant and compare its motion with the recorded one."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ _HELLO_PERIOD_S = 0.1
 def replay_in_process(run: Recorded) -> Difference:
     """Fly the scenario's plant with the recorded commands, in this process. Raises DivergenceError.
 
-    Of a lockstep log each command acts as it did. In real time it acted when it arrived, which the log knows to a
-    microsecond: the motion is then near the recorded one, and not the same.
+    With a lockstep log each command acts exactly as recorded. In real time it acted on arrival, which the log has to a
+    microsecond only: the motion is then close to the recorded one, not identical.
     """
     near, far = memory_pair()
     with near, far:
@@ -63,7 +63,7 @@ def replay_in_process(run: Recorded) -> Difference:
 
 
 def replay_into_process(run: Recorded, wait_s: float, stop: StopFlag) -> Difference:
-    """Start an emulator process and answer each of its ticks with what was recorded for it.
+    """Start an emulator process and answer each of its ticks with the recorded answer.
 
     Raises LinkError, PeerError and Interrupted.
     """
@@ -85,7 +85,7 @@ def _link_of(child: Child) -> str:
 
 
 def answer_emulator(run: Recorded, link: Link, wait_s: float, stop: StopFlag) -> dict[int, bytes]:
-    """Be the controller that was recorded; returns the datagram of each tick by its time (ns).
+    """Act as the recorded controller; returns the datagram of each tick by its time (ns).
 
     Raises PeerError, LinkError and Interrupted.
     """
@@ -105,9 +105,7 @@ def answer_emulator(run: Recorded, link: Link, wait_s: float, stop: StopFlag) ->
         data = link.recv(_HELLO_PERIOD_S)
         waits = 0 if data else waits + 1
         if waits * _HELLO_PERIOD_S > (_SILENCE_S if sent else wait_s):
-            raise PeerLostError(
-                "the emulator fell silent during the replay: see whether the scenario is that of the log"
-            )
+            raise PeerLostError("the emulator fell silent during the replay: check that the scenario is the log's")
         for frame in reader.read(data or b""):
             if frame.message_id == mapping.HEARTBEAT.message_id and mapping.heartbeat_is_ending(frame.payload):
                 return sent
@@ -120,7 +118,7 @@ def answer_emulator(run: Recorded, link: Link, wait_s: float, stop: StopFlag) ->
 
 
 def compare_motion(run: Recorded, sent: Mapping[int, bytes]) -> Difference:
-    """The recorded ticks and those of a replay: every byte that the emulator sent counts; shown is the pose."""
+    """The recorded ticks and those of a replay: every byte that the emulator sent is compared; the pose is shown."""
     recorded = {tick.t_ns: tick for tick in run.ticks}
     both = sorted(recorded.keys() & sent.keys())
     reader = FrameReader(is_datagram=True, follow_sequence=False)

@@ -1,4 +1,4 @@
-"""Keys pressed while a log plays: looked at without waiting, and only where standard input is a terminal of ours."""
+"""Keys pressed while a log plays: polled without waiting, and only where standard input is this process's terminal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from types import MappingProxyType, TracebackType
 from bridge.recording.replay import Player
 
 SEEK_S = 5.0
-HELP = "space: hold, go on   n: one frame   left, right: 5 s back, ahead   up, down: 60 s   q: end"
+HELP = "space: pause, resume   n: one frame   left, right: 5 s back, ahead   up, down: 60 s   q: end"
 
 KEYS: Mapping[bytes, Callable[[Player], None]] = MappingProxyType(
     {
@@ -29,7 +29,7 @@ KEYS: Mapping[bytes, Callable[[Player], None]] = MappingProxyType(
 
 
 class Keyboard:
-    """Acts on a player as keys are pressed. Ctrl-C stays what it is.
+    """Controls a player by key presses. Ctrl-C keeps its usual effect.
 
     active   whether there is a terminal to read from, with this process in its foreground
     """
@@ -45,7 +45,7 @@ class Keyboard:
             self.active = False
 
     def attend(self, player: Player) -> None:
-        """Do what the keys pressed since the last call ask for."""
+        """Carry out the keys pressed since the last call."""
         if not self.active or not select.select([self._file], [], [], 0)[0]:
             return
         data = self._rest + os.read(self._file, 256)

@@ -1,7 +1,7 @@
 """Two logs compared, sample by sample: rows of a message from one sender are paired by the time that the message carries.
 
-A message without a time (HEARTBEAT) is paired by its place in the order. Times since 1970 count from the first in each log.
-Frame sequence numbers and the stamps of the records are not compared: they tell of the link, not of the flight.
+A message without a time (HEARTBEAT) is paired by its position in the order. Times since 1970 count from the first in each log.
+Frame sequence numbers and the record time stamps are not compared: they describe the link, not the flight.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Times = npt.NDArray[np.int64]
 
 
 class Tolerances:
-    """How far two values may be apart and still count as the same: by MESSAGE.field, by field, or else."""
+    """How far two values may differ and still count as the same: by MESSAGE.field, by field, or for all other fields."""
 
     def __init__(self, default: float = 0.0, fields: Mapping[str, float] | None = None) -> None:
         self.default = default
@@ -48,7 +48,7 @@ def parse_tolerances(texts: Sequence[str]) -> Tolerances:
             value = -1.0
         if not value >= 0.0:
             raise UsageError(
-                f"--tolerance {text} is none: write FIELD=VALUE, MESSAGE.FIELD=VALUE, or one VALUE for the rest"
+                f"--tolerance {text} is not valid: write FIELD=VALUE, MESSAGE.FIELD=VALUE, or one VALUE for the rest"
             )
         if not separator:
             default = value
@@ -65,7 +65,7 @@ def _refuse_unknown(name: str) -> None:
         raise UsageError(f"--tolerance {name}: there is no message {message}: `fwav-hil log info` lists those of a log")
     candidates = [known[message]] if separator else list(known.values())
     if not any(field in candidate.fields for candidate in candidates):
-        raise UsageError(f"--tolerance {name}: there is no field {field}: write one that the messages have")
+        raise UsageError(f"--tolerance {name}: there is no field {field}: use a field of the messages")
 
 
 class FieldDifference(NamedTuple):
@@ -95,12 +95,12 @@ class LogDifference(NamedTuple):
 
     @property
     def is_same(self) -> bool:
-        """Whether every row has its partner, within the tolerances; of no row at all that cannot be said."""
+        """Whether every row has a partner within the tolerances; False where there are no rows."""
         paired = any(field.pairs for field in self.fields)
         return paired and not (self.only_first or self.only_second or any(field.beyond for field in self.fields))
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The result for JSON."""
         return {
             "same": self.is_same,
             "fields": [field._asdict() for field in self.fields],
@@ -139,7 +139,7 @@ def _compare_unknown(
     fields: list[FieldDifference],
     only: tuple[dict[str, int], dict[str, int]],
 ) -> None:
-    """Frames of messages that the dialect lacks: paired by their order, their payloads either the same or not."""
+    """Frames of messages that the dialect lacks: paired by their order, payloads compared as a whole."""
     groups = [_unknown_by_sender(scan) for scan in (first, second)]
     for message, sender in sorted(groups[0].keys() | groups[1].keys()):
         if types and message not in types:
@@ -179,7 +179,7 @@ def _by_sender(by_message: Mapping[str, Table]) -> dict[tuple[str, str], Table]:
 
 
 def _times_us(table: Table) -> Times:
-    """What the rows are paired by: the time that the message carries, or its place."""
+    """The key by which rows are paired: the time in the message, or its position."""
     for field, unit in _TIME_FIELDS:
         if field in (table.dtype.names or ()):
             times: Times = table[field].astype(np.int64) * unit
@@ -201,7 +201,7 @@ def _pair(one: Times, two: Times) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.
 
 
 def _numbered(ranks: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """For each row, how many rows of the same rank come before it."""
+    """For each row, the number of earlier rows of the same rank."""
     order = np.argsort(ranks, kind="stable")
     sorted_ranks = ranks[order]
     starts = np.searchsorted(sorted_ranks, sorted_ranks)
@@ -240,7 +240,7 @@ def _compare_fields(
 
 
 def _apart(one: npt.NDArray[Any], two: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    """How far the values (n,) or (n, k) of two rows are apart, the largest of each row; texts that differ are infinitely so."""
+    """The differences of the values (n,) or (n, k) of row pairs, the largest of each row; infinite for unequal texts."""
     if one.dtype.kind == "S":
         return np.where(one == two, 0.0, np.inf)
     if one.dtype.kind == "f":
@@ -250,7 +250,7 @@ def _apart(one: npt.NDArray[Any], two: npt.NDArray[Any]) -> npt.NDArray[np.float
         same = (a == b) | (np.isnan(a) & np.isnan(b))
         apart = np.where(same, 0.0, np.where(np.isnan(apart), np.inf, apart))
     else:
-        # As 64 bits without a sign the greater less the smaller is right for every kind of whole number.
+        # As unsigned 64-bit numbers, larger minus smaller is right for every integer type.
         a, b = (
             column.astype(np.int64 if column.dtype.kind == "i" else np.uint64).view(np.uint64) for column in (one, two)
         )

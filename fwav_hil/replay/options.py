@@ -1,4 +1,4 @@
-"""How a log is replayed: to a link, or into an end of the loop."""
+"""How a log is replayed: to a link, or into the controller or the emulator."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Speed(click.ParamType[float | None]):
     name = "speed"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | None:
-        """The factor, or fail with the sentence that names the remedy."""
+        """The factor; fails with a message that names the valid values."""
         if value == "max":
             return None
         try:
@@ -31,22 +31,22 @@ class Speed(click.ParamType[float | None]):
         except ValueError:
             factor = -1.0
         if not SLOWEST <= factor <= FASTEST:
-            self.fail(f"{value} is no speed: write a number from {SLOWEST:g} to {FASTEST:g}, or max", param, ctx)
+            self.fail(f"{value} is not a speed: write a number from {SLOWEST:g} to {FASTEST:g}, or max", param, ctx)
         return factor
 
 
 class ReplayOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How a log is replayed. speed: of log time; None is as fast as it goes. realtime: with what `real_time` asks for."""
+    """How a log is replayed. speed: times log time; None: as fast as possible. realtime: with the settings of `real_time`."""
 
     speed: Annotated[float | None, Option(
-        "--speed", "Of log time: 0.1 to 100, or max, as fast as it goes.", "X|max", type=Speed(), only_with=TO
+        "--speed", "Times log time: 0.1 to 100, or max: as fast as possible.", "X|max", type=Speed(), only_with=TO
     )] = 1.0  # fmt: skip
-    loop: Annotated[bool, Option("--loop", "Begin again at the end, until Ctrl-C.", only_with=TO)] = False
+    loop: Annotated[bool, Option("--loop", "Restart at the end, until Ctrl-C.", only_with=TO)] = False
     max_gap_s: Annotated[
-        float | None, Option("--max-gap", "Shorten longer silences to this.", "S", min=0.0, only_with=TO)
+        float | None, Option("--max-gap", "Shorten longer gaps to this.", "S", min=0.0, only_with=TO)
     ] = None
     rewrite_time: Annotated[bool, Option(
-        "--rewrite-time", "Move the messages' own times: those since 1970 begin now, those since boot at zero.",
+        "--rewrite-time", "Shift the times in the messages: those since 1970 begin now, those since boot at zero.",
         only_with=TO
     )] = False  # fmt: skip
     key: Annotated[bytes | None, Option(
@@ -58,11 +58,11 @@ class ReplayOptions(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class IntoOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """What is replayed into a controller or an emulator, and where a difference goes. fast: without a link."""
+    """How a log is replayed into a controller or an emulator, and where differences are saved. fast: without a link."""
 
     law: Annotated[str | None, replace(LAW, only_with=INTO)] = None
     scenario: Annotated[str | None, Option(
-        "--scenario", "Scenario of the log, instead of the one in the log's folder (--into).", "SCENARIO",
+        "--scenario", "Scenario of the log, instead of the one in its folder (--into).", "SCENARIO",
         only_with=INTO
     )] = None  # fmt: skip
     fast: Annotated[bool, Option("--fast", "Replay within this process, without a link (--into).", only_with=INTO)] = (

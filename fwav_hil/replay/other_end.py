@@ -1,4 +1,4 @@
-"""The live other end of a replay: a process that is watched while it is talked to, and never left behind."""
+"""The live peer of a replay: a child process that is watched while it runs, and always ended."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from protocol.errors import PeerLostError
 
 
 class WatchingStop(StopFlag):
-    """A wish to stop that also looks whether the other end still runs."""
+    """A stop flag that also checks whether the peer still runs."""
 
     def __init__(self, stop: StopFlag, child: Child) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""A recorded run as both ends saw it: the ticks of the emulator, and the commands that came upon each."""
+"""A recorded run as both ends saw it: the ticks of the emulator, and the commands received after each."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from protocol.wire.parameter_mapping import VALUE, decode_value
 
 
 class Tick(NamedTuple):
-    """One tick: its time (ns), its stamp (us), what the emulator sent, and what the controller said before the next one."""
+    """One tick: its time (ns), its stamp (us), what the emulator sent, and what the controller sent before the next one."""
 
     t_ns: int
     stamp_us: int
@@ -29,17 +29,17 @@ class Tick(NamedTuple):
 
     @property
     def parameters(self) -> list[tuple[str, float | None]]:
-        """(name, value) of each parameter that the controller said."""
+        """(name, value) of each parameter that the controller sent."""
         return [decode_value(frame.payload) for _, frame in self.answers if frame.message_id == VALUE.message_id]
 
     @property
     def answer(self) -> bytes:
-        """All that came upon the tick, as one datagram."""
+        """All frames received after the tick, as one datagram."""
         return b"".join(frame.raw for _, frame in self.answers)
 
 
 class Recorded(NamedTuple):
-    """A run out of its log. commands: payload of the command that answers each sample, by the sample's time (ns)."""
+    """A run read from its log. commands: payload of the command that answers each sample, by the sample's time (ns)."""
 
     log: Path
     scenario: Scenario
@@ -49,7 +49,7 @@ class Recorded(NamedTuple):
 
 
 def recorded_run(log: Path, scenario_name: str | None, law: str | None) -> Recorded:
-    """The run in a log, with the scenario of its folder or the one named, and another law where one is named.
+    """The run in a log, with the scenario of its folder or the given one, and optionally another law.
 
     Raises LogError, ScenarioError, and UsageError where there is no scenario.
     """
@@ -66,7 +66,7 @@ def recorded_run(log: Path, scenario_name: str | None, law: str | None) -> Recor
                 commands.setdefault(int.from_bytes(payload[:8], "little") * 1000, payload)
     if not ticks:
         raise LogError(
-            f"{path} holds no sample (ATT_POS_MOCAP with its HIL_SENSOR) of {VEHICLE[0]}/{scenario.wire.emulator_component}:"
+            f"{path} has no sample (ATT_POS_MOCAP with its HIL_SENSOR) of {VEHICLE[0]}/{scenario.wire.emulator_component}:"
             " only logs of this project's runs can be replayed into its ends"
         )
     scenario = followed(scenario, ticks[0].parameters)  # gains that a ground station had set before the start
@@ -79,7 +79,7 @@ def _scenario_of(log: Path, name: str | None) -> Scenario:
     beside = log.parent / "scenario.toml"
     if not beside.exists():
         raise UsageError(
-            f"there is no scenario.toml beside {log}: name the scenario that it was flown with by --scenario"
+            f"there is no scenario.toml beside {log}: give the scenario that it was flown with by --scenario"
         )
     return load_scenario(beside)
 

@@ -1,4 +1,4 @@
-"""What was recorded and what a replay gave, side by side: figures, a table and a plot."""
+"""Recorded and replayed values compared: figures, a table and a plot."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SHOWN = {
 
 
 class Difference(NamedTuple):
-    """Two runs by their samples.
+    """Two runs compared sample by sample.
 
     what       "command": tau, body frame (N, N m), or "motion": position and attitude as measured (m, rad)
     t_ns       (n,) times of the samples that both have; recorded, replayed (n, 6)
@@ -38,11 +38,11 @@ class Difference(NamedTuple):
 
     @property
     def is_zero(self) -> bool:
-        """Whether nothing differs, not a byte."""
+        """Whether no byte differs."""
         return bool(self.equal.all()) and self.missing == 0 and len(self.t_ns) > 0
 
     def figures(self) -> dict[str, Any]:
-        """Maximum and RMS by axis, and when the two first part; SI units."""
+        """Maximum and RMS by axis, and the time of the first difference; SI units."""
         error = self.replayed - self.recorded
         apart = np.flatnonzero(~self.equal)
         units = ("N",) * 3 + ("N m",) * 3 if self.what == "command" else AXIS_UNITS
@@ -86,7 +86,7 @@ def print_difference(difference: Difference, title: str, *, to_stderr: bool) -> 
 
 
 def plot_difference(difference: Difference, title: str, path: Path) -> None:
-    """Record, replay and their difference by axis, as PNG. Raises RunFolderError."""
+    """Plot recording, replay and their difference by axis, as PNG. Raises RunFolderError."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

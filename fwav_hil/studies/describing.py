@@ -1,12 +1,12 @@
-"""The describing function of the gears, and the limit cycles that it predicts (harmonic balance).
+"""The describing function of the gears, and the limit cycles predicted with it (harmonic balance).
 
-tau = A sin(phi) goes through the gear's own step function (`plant_emulator.plant.backlash`) until it repeats; the first
-harmonic of what comes out over that of what went in is N(A): complex, and the same at every frequency, since the gear has no
-time of its own. A constant share of tau changes nothing. A gear of slope h has N = h; the hysteresis has |N| < h and a
-phase lag.
+tau = A sin(phi) is passed through the gear's own step function (`plant_emulator.plant.backlash`) until the output is
+periodic; the first harmonic of the output divided by that of the input is N(A): complex, and the same at every frequency,
+since the gear is rate independent. A constant part of tau has no effect. A gear of slope h has N = h; the hysteresis has
+|N| < h and a phase lag.
 
-In the linear loop N(A) takes the place of h. A limit cycle is where 1 + N(A) L(j omega) = 0: where a pole of the loop with
-that gain is on the unit circle. It attracts where the loop grows at smaller amplitudes and decays at larger ones.
+In the linear loop N(A) replaces h. A limit cycle is where 1 + N(A) L(j omega) = 0: where a pole of the loop with
+that gain is on the unit circle. It is stable where oscillations grow at smaller amplitudes and decay at larger ones.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Gear(NamedTuple):
 
     @property
     def amplitude(self) -> float:
-        """The amplitude of tau at which the hysteresis shows most, about: 1/chi, or the half width."""
+        """Approximate amplitude of tau at which the hysteresis is most visible: 1/chi, or the half width."""
         return self.p if self.model == PLAY else 1.0 / self.chi
 
     @property
@@ -46,7 +46,7 @@ class Gear(NamedTuple):
         return 0.0 if self.model == PLAY else 2.0 * self.p - self.h
 
     def alike(self, other: Gear) -> bool:
-        """Whether both have the same N(A)/h, but for the scale of A."""
+        """Whether both have the same N(A)/h, except for the scale of A."""
         mine, theirs = (0.0 if gear.model == PLAY else gear.p / gear.h for gear in (self, other))
         return self.model == other.model and math.isclose(mine, theirs, rel_tol=1e-9)
 
@@ -80,7 +80,7 @@ def _first_harmonic(
 def describing_function(gear: Gear, amplitude: float) -> complex:
     """N(A) for tau of that amplitude (N, N m); the imaginary part is negative: a lag."""
     model, h, p, chi = gear
-    # At the lower end of a settled stroke d is at the height that the next half stroke turns into its negative.
+    # In the periodic motion d at the lower end is such that the next half stroke changes its sign.
     d = (h - p) / chi * math.tanh(chi * amplitude) if model == BACKLASH else h * p
     u = -h * amplitude + d
     for _ in range(_PERIODS):
@@ -95,7 +95,7 @@ def describing_function(gear: Gear, amplitude: float) -> complex:
 class LimitCycle(NamedTuple):
     """A predicted oscillation: amplitude of tau (N, N m), frequency (rad/s), amplitude of q (m, rad); attracting or not.
 
-    One that does not attract is a border: the loop settles from below that amplitude and grows from above it.
+    One that does not attract is a boundary: oscillations below that amplitude decay, those above it grow.
     """
 
     amplitude: float
@@ -105,7 +105,7 @@ class LimitCycle(NamedTuple):
 
 
 def growth(channel: Channel, gear: Gear, delay_s: float, amplitude: float) -> tuple[float, float]:
-    """(modulus, frequency in rad/s) of the outermost oscillating pole of the loop in which N(A) stands for h."""
+    """(modulus, frequency in rad/s) of the outermost oscillating pole of the loop with N(A) in place of h."""
     gain = channel.ratio * describing_function(gear, amplitude) / gear.h
     poles = channel.poles(complex(gain), delay_s)
     outermost = poles[np.argmax(np.abs(poles))]
@@ -113,7 +113,7 @@ def growth(channel: Channel, gear: Gear, delay_s: float, amplitude: float) -> tu
 
 
 def amplitudes(gear: Gear, count: int) -> FloatArray:
-    """A logarithmic grid from far below (a play passes nothing there) to far above the width of the hysteresis."""
+    """A logarithmic grid from far below (a play's output is zero there) to far above the width of the hysteresis."""
     least = 1.01 if gear.model == PLAY else 0.02
     return np.geomspace(least, 500.0, count) * (gear.amplitude or 1.0)
 
@@ -130,7 +130,7 @@ def limit_cycles(channel: Channel, gear: Gear, b: float, delay_s: float) -> list
             brentq(lambda a: growth(channel, gear, delay_s, math.exp(a))[0] - 1.0, grid[i], grid[i + 1], xtol=1e-6)
         )
         _, frequency = growth(channel, gear, delay_s, amplitude)
-        # The plant alone: q = N/h ratio b tau / -(omega^2), but for the hold.
+        # The plant alone: q = N/h ratio b tau / -(omega^2), except for the hold.
         size = abs(describing_function(gear, amplitude)) / gear.h * channel.ratio * b
         found.append(LimitCycle(amplitude, frequency, size * amplitude / frequency**2, excess[i] > 0.0))
     return found

@@ -1,14 +1,14 @@
 """Gains for a link: the search for K, Lambda, T and N of position and of attitude.
 
-Least tracking error, subject to: gain margin of 2 both ways and stability at twice the delay, by the eigenvalues of the
-linear loop (`loop_model`), and no flight lost (`flight_check`), neither at the link's delay nor at twice that.
+It minimises the tracking error subject to: a gain margin of 2 both ways and stability at twice the delay, by the eigenvalues
+of the linear loop (`loop_model`), and no flight lost (`flight_check`), neither at the link's delay nor at twice that.
 
 The error of a set of gains is the geometric mean of the RMSE of the group's axes, over the whole flight and from 2 s on, over
-a few seeds of noise: so axes count alike, whatever their units, and so do start-up and steady flight. The optimiser is
-scipy's differential evolution over the logarithms of the gains, attitude first (it does not depend on position), position
-then. The scenario's own gains take part (those of the group's first axis, held within the bounds of the search); and where
-they hold on this link, a cell (axis, whole flight or from 2 s on) that comes out worse than theirs is punished, so that no
-axis pays for another.
+a few seeds of noise: axes of any unit have equal weight, and so have start-up and steady flight. The optimiser is
+scipy's differential evolution over the logarithms of the gains, first attitude (it does not depend on position), then
+position. The scenario's own gains are a candidate (those of the group's first axis, clipped to the bounds of the search);
+where they fly on this link, a cell (axis, whole flight or from 2 s on) that is worse than theirs is penalised, so that no
+axis improves at the cost of another.
 """
 
 from __future__ import annotations
@@ -35,34 +35,34 @@ from protocol.scenario import NANOSECONDS, Delay, Scenario, Vector6, replace_gai
 
 MARGIN = 2.0
 _SPARE = 1.01
-"""The search keeps this much more than the margin, so that rounding its result does not lose it."""
+"""Additional margin kept by the search, so that rounding its result does not lose the margin."""
 
 SEARCHED = {
     "ude": ("K", "Lambda", "T", "N"),
     "ude_state": ("K", "Lambda", "T"),
     "uncompensated": ("K", "Lambda", "N"),
 }
-"""The gains that a law has. The baselines have their own, Kp and Kd, which are not searched for."""
+"""The gains searched, by law. The baselines' gains, Kp and Kd, are not searched."""
 
 TABLES = {"K": "ude", "Lambda": "ude", "T": "filters", "N": "filters"}
-"""The table of each, within the scenario's [gains]."""
+"""The table of each gain, within the scenario's [gains]."""
 
 _BOUNDS = {"K": (0.02, 3.0), "Lambda": (0.003, 1.0), "T": (0.2, 30.0), "N": (0.2, 30.0)}
-"""Lowest and highest of each, in units of 1/d (T: of d), d being the delay and one and a half periods."""
+"""Lowest and highest of each, in units of 1/d (T: of d), d being the delay plus one and a half periods."""
 
 _POPULATION = 8
-"""Sets of gains in a generation, for each gain searched."""
+"""Number of gain sets in a generation, for each gain searched."""
 
 _PUNISHED = 10.0
 _CLEARLY = 0.03
-"""A cell should be better by three per cent, since the seeds of the search are not those of the flights to come."""
+"""A cell should be better by three per cent, since later flights have other seeds than the search."""
 
 _INFEASIBLE = 1e3
 _LOST = 1e2
 
 
 class Group(NamedTuple):
-    """Three axes that share their gains."""
+    """Three axes with common gains."""
 
     name: str
     axes: range
@@ -72,9 +72,9 @@ GROUPS = (Group("attitude", range(3, 6)), Group("position", range(3)))
 
 
 class Task(msgspec.Struct, frozen=True):
-    """What one evaluation needs: the scenario with what is known so far, the group, and the seeds to fly.
+    """The data of one evaluation: the scenario with the gains found so far, the group, and the seeds to fly.
 
-    own: mean log RMSE of the group's axes with the gains of the start, as `flown_error` has it; None where a flight is lost.
+    own: mean log RMSE of the group's axes with the initial gains, as from `flown_error`; None where a flight is lost.
     """
 
     scenario: Scenario
@@ -97,16 +97,16 @@ def with_gains(scenario: Scenario, axes: Iterable[int], names: Iterable[str], va
 
 
 def gain_of(scenario: Scenario, name: str) -> Vector6:
-    """A gain of those searched, on each axis."""
+    """One of the searched gains, on each axis."""
     table = TABLES[name]
     gain: Vector6 = getattr(scenario.read_gains(table, UdeGains if table == "ude" else Filters), name)
     return gain
 
 
 def shortfall(scenario: Scenario, axes: Iterable[int], margin: float = MARGIN, law: Realisation | None = None) -> float:
-    """How far the loops of these axes are from their margins: the poles' excess over the unit circle, summed; 0: none.
+    """How far the loops of these axes miss their margins: the poles' excess over the unit circle, summed; 0: not at all.
 
-    Looked at: gains from 1/margin to margin times at the delay, and delays from none to margin times. `law`: made before.
+    Checked: gains from 1/margin to margin times at the delay, and delays from 0 to margin times. `law`: reused if given.
     """
     delay_s = scenario.delay_ns / NANOSECONDS
     loops = list(channels_of(scenario, law or make_realisation(scenario.law, scenario)).values())
@@ -166,7 +166,7 @@ def cost(task: Task, logarithms: FloatArray) -> float:
 
 
 class Found(NamedTuple):
-    """What a search came to: the scenario with its gains, and how many sets of gains were tried."""
+    """The result of a search: the scenario with its gains, and how many sets of gains were tried."""
 
     scenario: Scenario
     evaluations: int
@@ -176,7 +176,7 @@ Map = Callable[[Callable[[FloatArray], float], Iterable[FloatArray]], Iterable[f
 
 
 def gains_of(scenario: Scenario) -> tuple[str, ...]:
-    """The names of the gains of the scenario's law. Raises UsageError for a law whose gains are not searched for."""
+    """The names of the gains of the scenario's law. Raises UsageError for a law whose gains cannot be searched."""
     if scenario.law not in SEARCHED:
         raise UsageError(
             f"`design` searches the gains K, Lambda, T and N, which the law '{scenario.law}' does not have: "
@@ -205,7 +205,7 @@ def search(
     mapping: Callable[[Task], Map],
     progress: Callable[[str, float], None] = lambda _group, _cost: None,
 ) -> Found:
-    """Search attitude, then position; `mapping` makes the map over candidates for a task; `progress` hears each generation.
+    """Search attitude, then position; `mapping` makes the map over candidates for a task; `progress`: called each generation.
 
     seed: of the optimiser; the flights' noise has the scenario's seed and those after it. Raises UsageError where no gains
     within the bounds have the margins, and for a scenario of less than 4 s.
@@ -213,7 +213,7 @@ def search(
     names = gains_of(scenario)
     if scenario.duration_s < 2.0 * SETTLED_S:
         raise UsageError(
-            f"duration_s {scenario.duration_s:g} is too short to judge gains by: make it {2.0 * SETTLED_S:g} s or more"
+            f"duration_s {scenario.duration_s:g} is too short to judge gains: make it {2.0 * SETTLED_S:g} s or more"
         )
     evaluations = 0
     for group in GROUPS:
@@ -251,19 +251,19 @@ def search(
 
 
 def _evaluated_by_the_map(_: FloatArray) -> float:
-    """The optimiser hands this to the map, which evaluates the task in its place."""
+    """The optimiser passes this to the map, which evaluates the task instead."""
     raise NotImplementedError
 
 
 def _teller(name: str, progress: Callable[[str, float], None]) -> Callable[[OptimizeResult], None]:
-    def tell(intermediate_result: OptimizeResult) -> None:  # the optimiser goes by this name
+    def tell(intermediate_result: OptimizeResult) -> None:  # the optimiser requires this argument name
         progress(name, float(intermediate_result.fun))
 
     return tell
 
 
 def _rounded(scenario: Scenario, group: Group, names: Iterable[str]) -> Scenario:
-    """Gains to three digits, where the margins stand it."""
+    """Gains rounded to three digits, if they keep the margins."""
     names = tuple(names)
     values = [float(f"{gain_of(scenario, name)[group.axes[0]]:.3g}") for name in names]
     plain = with_gains(scenario, group.axes, names, values)
@@ -271,7 +271,7 @@ def _rounded(scenario: Scenario, group: Group, names: Iterable[str]) -> Scenario
 
 
 class Comparison(msgspec.Struct, frozen=True, kw_only=True):
-    """Gains flown over seeds that the search has not seen: RMSE by axis (m, rad), median and worst; or why one is lost."""
+    """Gains flown over seeds not used in the search: RMSE by axis (m, rad), median and worst; or why a flight is lost."""
 
     rmse_median: dict[str, float] | None
     rmse_worst: dict[str, float] | None

@@ -21,27 +21,27 @@ from protocol.scenario import find_scenario, load_scenario
 def design_command(
     choice: Annotated[ScenarioChoice, Except("duration_s", "seed")],
     out: Annotated[
-        Path, Option("--out", "The scenario file to write; one that exists is left alone.", "FILE.toml", type=FILE)
+        Path, Option("--out", "The scenario file to write; it must not exist.", "FILE.toml", type=FILE)
     ],
     delay_s: Annotated[float | None, Option(
-        "--delay-s", "Total delay, sample to action, instead of the scenario's.", "S", min=0.0, max=1.0
+        "--delay-s", "Total delay from sample to action, instead of the scenario's.", "S", min=0.0, max=1.0
     )] = None,
     seed: Annotated[int, Option("--seed", "Seed of the optimiser.", min=0)] = 1,
     flights: Annotated[
-        int, Option("--flights", "Flights per set of gains, each with noise of its own.", "N", min=1)
+        int, Option("--flights", "Flights per set of gains, each with another noise seed.", "N", min=1)
     ] = 4,
     generations: Annotated[
         int, Option("--generations", "Generations of the search, for attitude and for position.", "N", min=1)
     ] = 20,
     workers: Annotated[
-        int | None, Option("--workers", "Processes to search on; by default one a core.", "N", min=1)
+        int | None, Option("--workers", "Number of search processes; by default one per core.", "N", min=1)
     ] = None,
     json_path: JsonPath = None,
 ) -> None:  # fmt: skip
-    """Search gains K, Lambda, T and N for the link of SCENARIO: its rate, delay, noise and limits.
+    """Search for gains K, Lambda, T and N for the link of SCENARIO: its rate, delay, noise and limits.
 
-    Least tracking error with a gain margin of at least 2 both ways and stability at twice the delay. The result is a scenario
-    file; what it gains over the scenario's own gains is flown over seeds that the search has not seen.
+    The search minimises the tracking error with a gain margin of at least 2 both ways and stability at twice the delay. The
+    result is a scenario file; old and new gains are then compared over seeds not used in the search.
     """
     from bridge.process import StopFlag
     from controller.laws.registry import check_law
@@ -66,7 +66,7 @@ def design_command(
         found = search(
             start, seed=seed, flights=flights, generations=generations, mapping=candidates, progress=shown.generation
         )
-        shown.text("flying seeds that the search has not seen")
+        shown.text("flying seeds not used in the search")
         result = judge_design(start, found, stop=stop, seed=seed, flights=flights, generations=generations)
     text = scenario_text(result, base_path, out)
     try:
@@ -84,7 +84,7 @@ def design_command(
 def refuse(out: Path) -> None:
     """Raise RunFolderError, before the search, where the file exists already or has no folder to go to."""
     if out.exists():
-        raise RunFolderError(f"{out} exists already and stays: choose another file with --out, or remove it")
+        raise RunFolderError(f"{out} already exists: choose another file with --out, or remove it")
     if not out.parent.is_dir():
         raise RunFolderError(
             f"cannot write {out}: there is no folder {out.parent}; make it, or choose another with --out"
@@ -92,7 +92,7 @@ def refuse(out: Path) -> None:
 
 
 class _Shown:
-    """How far the search is, on standard error: a bar on a terminal, a line every few generations elsewhere."""
+    """Progress of the search, on standard error: a bar on a terminal, a line every few generations elsewhere."""
 
     _EVERY = 5
 
@@ -106,7 +106,7 @@ class _Shown:
         self._count = 0
 
     def generation(self, group: str, cost: float) -> None:
-        """One generation of a group is done; `cost` is the best so far."""
+        """Called after each generation of a group; `cost` is the best so far."""
         from fwav_hil.studies.design_result import show_cost
 
         self._count += 1
@@ -115,7 +115,7 @@ class _Shown:
             click.echo(f"{group}, generation {self._count}: {show_cost(cost)}", err=True)
 
     def text(self, text: str) -> None:
-        """What is done after the search."""
+        """Show the step after the search."""
         self._bar.update(self._task, description=text)
         if not self._is_terminal:
             click.echo(text, err=True)

@@ -1,4 +1,4 @@
-"""Evaluating candidates of a design on every core, so that a stop is heard at once."""
+"""Evaluation of design candidates on every core; it reacts to a stop at once."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ _LOOK_S = 0.1
 
 
 def cores() -> int:
-    """How many cores this process may use."""
+    """The number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _begin_worker() -> None:
-    """A worker ends with its parent, and leaves Ctrl-C to it."""
+    """Let a worker end with its parent and ignore Ctrl-C."""
     end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @contextmanager
 def mapping(workers: int, stop: StopFlag) -> Iterator[Callable[[Task], Map]]:
-    """A map over candidates for each task, on `workers` processes (1: this one). A stop raises Interrupted from within it."""
+    """A map over candidates for each task, on `workers` processes (1: this one). A stop raises Interrupted in it."""
     if workers == 1:
 
         def here(task: Task) -> Map:

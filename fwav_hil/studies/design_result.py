@@ -1,4 +1,4 @@
-"""What a design came to: flown over seeds not seen before, judged, as a scenario file, a table and JSON."""
+"""The result of a design: compared over seeds not used in the search, judged, as a scenario file, a table and JSON."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from protocol.scenario import NANOSECONDS, Delay, Scenario
 
 HELD_OUT = 20
 _FAR = 100_000
-"""Seeds of the comparison begin this far from the scenario's, beyond any that a search flies."""
+"""Offset of the comparison's seeds from the scenario's, beyond any seed that a search flies."""
 
 
 class Design(msgspec.Struct, frozen=True, kw_only=True):
@@ -56,7 +56,7 @@ class Design(msgspec.Struct, frozen=True, kw_only=True):
     generations: int
 
     def as_json(self) -> dict[str, Any]:
-        """As `--json` writes it."""
+        """The result as `--json` writes it."""
         return {
             "scenario": self.start.name,
             "law": self.designed.law,
@@ -83,14 +83,14 @@ class Design(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def with_delay(scenario: Scenario, delay_s: float) -> Scenario:
-    """The scenario with this total delay (s): whole samples of it as such where it is a whole number of them."""
+    """The scenario with this total delay (s): given in samples where it is a whole number of them."""
     samples = round(delay_s * NANOSECONDS) / scenario.period_ns
     delay = Delay(samples=int(samples)) if samples == int(samples) <= 1000 else Delay(samples=0, seconds=delay_s)
     return msgspec.structs.replace(scenario, delay=delay)
 
 
 def judge_design(start: Scenario, found: Found, *, stop: StopFlag, seed: int, flights: int, generations: int) -> Design:
-    """Fly old and new gains over the same held-out seeds, and give the verdict of `margin`. Raises Interrupted."""
+    """Fly old and new gains over the same held-out seeds, with the verdict of `margin`. Raises Interrupted."""
     first = start.seed + _FAR
     seeds = range(first, first + HELD_OUT)
     before, old = compare(start, seeds)
@@ -119,7 +119,7 @@ def judge_design(start: Scenario, found: Found, *, stop: StopFlag, seed: int, fl
 
 
 def scenario_text(result: Design, base_path: Path, out: Path) -> str:
-    """The scenario file: what differs from the base where that is beside it, else all; with where its numbers come from."""
+    """The scenario file, with comments on its origin: only differences where the base file is beside it, else all keys."""
     designed, start = result.designed, result.start
     stem = out.stem.lower()
     name = stem if re.fullmatch(r"[a-z0-9][a-z0-9_\-]*", stem) else f"{start.name}_designed"
@@ -154,10 +154,10 @@ def _least(values: Any) -> float:
 
 
 def show_cost(cost: float) -> str:
-    """A cost of the search in words."""
+    """A cost of the search as text."""
     if cost >= 1000.0:
         return "no gains with the margins yet"
-    return "no flight held yet" if cost >= 100.0 else f"log RMSE {cost:.4f}"
+    return "every flight lost yet" if cost >= 100.0 else f"log RMSE {cost:.4f}"
 
 
 def print_design(result: Design, *, to_stderr: bool = False) -> None:
@@ -178,7 +178,7 @@ def print_design(result: Design, *, to_stderr: bool = False) -> None:
                 f"{1e3 * _least(margins[axis].max_delay_s for axis in axes):.1f} ms",
             )
     console.print(gains)
-    errors = Table("axis", title=f"RMSE, median of {HELD_OUT} seeds that the search has not seen", title_justify="left")
+    errors = Table("axis", title=f"RMSE, median of {HELD_OUT} seeds not used in the search", title_justify="left")
     for column in ("old", "new", "old, from 2 s", "new, from 2 s"):
         errors.add_column(column, justify="right")
     for axis in AXES:
@@ -192,7 +192,7 @@ def print_design(result: Design, *, to_stderr: bool = False) -> None:
         errors.add_row(AXIS_NAMES[axis], *cells)
     console.print(errors)
     if result.before.lost:
-        console.print(f"the old gains do not hold on this link: {result.before.lost}")
+        console.print(f"a flight with the old gains is lost on this link: {result.before.lost}")
     if result.improvement is not None:
         console.print(
             f"RMSE with the new gains is {result.improvement:.3f} of that with the old, in the geometric mean"

@@ -1,13 +1,13 @@
-"""The check of the linear figures on the whole plant: hysteresis, limits, rotation, noise, as `simulate` has them.
+"""The check of the linear figures on the whole plant: hysteresis, limits, rotation, noise, as in `simulate`.
 
-**When is a flight lost?** Diverging is the clear case, but limits turn many a divergence into a saturated oscillation that
-goes on for ever. So a flight is lost where it diverges, or where in the second half of its time
+**When is a flight lost?** If it diverges; but limits turn many divergences into a saturated oscillation that never
+ends. So a flight is lost where it diverges, or where in the second half of its time
 
 - more than 20 % of the commands are at a limit, and
 - on some axis the RMS error is over a quarter of the reference's own RMS swing, and over ten times the sensor's noise.
 
-Both together: a limit touched now and then is no loss, nor is a constant error (a PD without gravity feed-forward), nor the
-small limit cycle of a worn gear, which keeps off the limits.
+Both must hold: a limit reached occasionally is not a loss, nor is a constant error (a PD without gravity feed-forward), nor
+the small limit cycle of a worn gear, which stays within the limits.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _SHORTEST_S = 10.0
 
 
 class Flight(msgspec.Struct, frozen=True, kw_only=True):
-    """One flight judged.
+    """The judgement of one flight.
 
     saturated   share of the commands of the second half with an axis at a limit
     error       by axis: RMS error of the second half over the reference's RMS swing there; None where it does not move
@@ -46,9 +46,9 @@ class Flight(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def fly(scenario: Scenario, delay_s: float, law: Law | None = None) -> Flight:
-    """Simulate the scenario with this total delay (s, at most 1) in place of its own, and judge it; `law`: made before.
+    """Simulate the scenario with this total delay (s, at most 1) in place of its own, and judge it; `law`: reused if given.
 
-    It lasts as long as the scenario, but 10 s at least (a start-up alone says nothing) and 20 s at most.
+    It lasts as long as the scenario, but at least 10 s (a start-up alone is not enough) and at most 20 s.
     """
     duration_s = min(max(scenario.duration_s, _SHORTEST_S), 2.0 * _SHORTEST_S)
     delayed = msgspec.structs.replace(scenario, delay=Delay(samples=0, seconds=delay_s), duration_s=duration_s)
@@ -56,7 +56,7 @@ def fly(scenario: Scenario, delay_s: float, law: Law | None = None) -> Flight:
 
 
 def judge_flight(scenario: Scenario, result: Simulation) -> Flight:
-    """Judge a flight by the definition at the head of this module."""
+    """Judge a flight by the definition at the top of this module."""
     half = len(result.t_ns) // 2
     error = _rms(tracking_error(scenario, result.q)[half:])
     desired = desired_positions(scenario, len(result.q))[half:]
@@ -102,7 +102,7 @@ def without_hysteresis(scenario: Scenario) -> Scenario:
 
 
 def with_far_limits(scenario: Scenario, factor: float = 100.0) -> Scenario:
-    """Actuator limits, and the scales of the wire, that many times as far."""
+    """Actuator limits, and the wire's scales, multiplied by that factor."""
     actuators = scenario.actuators
 
     def far(values: Vector6) -> Vector6:
@@ -118,12 +118,12 @@ def with_far_limits(scenario: Scenario, factor: float = 100.0) -> Scenario:
 
 
 def without_noise(scenario: Scenario) -> Scenario:
-    """Perfect sensors."""
+    """The scenario without sensor noise."""
     return msgspec.structs.replace(scenario, noise=Noise())
 
 
 def about_rest(scenario: Scenario) -> Scenario:
-    """The vehicle held at the origin, let go 1 mm and .01 rad off: motions so small that no axis turns another's forces."""
+    """The vehicle held at the origin, released 1 mm and .01 rad off: motions too small to couple the axes by rotation."""
     return msgspec.structs.replace(
         scenario,
         reference=msgspec.structs.replace(scenario.reference, amplitude=ZERO6, initial=ZERO6),
@@ -138,7 +138,7 @@ VARIANTS: tuple[tuple[str, Callable[[Scenario], Scenario]], ...] = (
     ("small motions about rest", about_rest),
     ("small motions, no noise, no hysteresis", lambda s: without_noise(without_hysteresis(about_rest(s)))),
 )
-"""What is taken out of the plant to see what makes the difference to the linear figure; the last is the linear loop."""
+"""Parts removed from the plant to find the cause of the difference to the linear figure; the last is the linear loop."""
 
 
 def _rms(values: FloatArray) -> FloatArray:
@@ -192,7 +192,7 @@ def flown_delay(
 
 
 class Oscillation(msgspec.Struct, frozen=True, kw_only=True):
-    """What a loop left to itself does on one axis: amplitudes of q (m, rad) and tau (N, N m), frequency (rad/s).
+    """The free motion of one axis in closed loop: amplitudes of q (m, rad) and tau (N, N m), frequency (rad/s).
 
     All None: the flight diverged. Amplitudes 0 and no frequency: it comes to rest.
     """
@@ -203,11 +203,11 @@ class Oscillation(msgspec.Struct, frozen=True, kw_only=True):
 
 
 _AT_REST = 0.01
-"""An oscillation below this share of the offset that the axis was let go at is none."""
+"""An oscillation below this share of the axis's initial offset counts as rest."""
 
 
 def at_rest(scenario: Scenario, offset: FloatArray, duration_s: float = 20.0) -> dict[str, Oscillation]:
-    """Hold the vehicle at the origin, without noise and disturbance, let go at `offset` (6,): what the last half shows.
+    """Hold the vehicle at the origin, without noise and disturbance, released at `offset` (6,): the motion in the last half.
 
     Amplitudes are those of a sine of the same power; the frequency is that of the spectrum's peak (to about 0.3 rad/s).
     """
@@ -240,7 +240,7 @@ def at_rest(scenario: Scenario, offset: FloatArray, duration_s: float = 20.0) ->
 
 
 def _without_drift(values: FloatArray) -> FloatArray:
-    """What is left when a cubic has been taken out: the slow way to rest is no oscillation."""
+    """The remainder after subtracting a cubic fit: the slow approach to rest is not an oscillation."""
     if len(values) < 8:
         return values - values.mean() if len(values) else values
     t = np.linspace(-1.0, 1.0, len(values))

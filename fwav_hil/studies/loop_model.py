@@ -1,11 +1,11 @@
-"""The linear loop of each channel, made of the law's own discrete matrices: stability, margins, the largest delay.
+"""The linear loop of each channel, from the law's own discrete matrices: stability, margins, the largest delay.
 
 Per channel the plant is the double integrator q'' = g tau, g = slope of the gear / inertia. The command of sample k acts on
-[t_k + delay, t_(k+1) + delay), as in the emulator: hold and delay, fractional or not, are in the matrices exactly. What the
-law is told to have been applied is what it asked for: no limit acts here. Stable means that every eigenvalue of the closed
-loop lies within the unit circle; frequency responses only propose where the borders are, eigenvalues decide.
+[t_k + delay, t_(k+1) + delay), as in the emulator: hold and delay, fractional or not, are in the matrices exactly. The
+applied command equals the commanded one: no limit acts here. Stable means that every eigenvalue of the closed
+loop lies within the unit circle; frequency responses only give estimates of the boundaries, eigenvalues decide.
 
-Left out: the coupling of the axes (rotation, gyration), limits, noise, and of the hysteresis all but a gain, which may be
+Left out: the coupling of the axes (rotation, gyration), limits, noise; the hysteresis is only a gain, which may be
 complex (a describing function). tau is multiplied by b here, so a plant's gain is the ratio g/b.
 """
 
@@ -29,7 +29,7 @@ ComplexArray = npt.NDArray[np.complex128]
 _LOWEST_RAD_S = 1e-3
 _MOST_STEPS, _ROUNDING = 100, 1e-13
 _ENOUGH_SAMPLES = 600
-"""A loop that stands more periods of delay than these is said to have no limit."""
+"""A loop that is stable with more periods of delay than this is reported to have no limit."""
 
 
 class Channel:
@@ -54,7 +54,7 @@ class Channel:
         self.A, self.B, self.B_tau, self.C, self.D = A, B, B_tau, C, D
 
     def twin_of(self, other: Channel) -> bool:
-        """Whether both are the same loop, but for rounding."""
+        """Whether both are the same loop, except for rounding."""
         return bool(np.isclose(self.ratio, other.ratio, rtol=1e-9)) and all(
             np.allclose(mine, theirs, rtol=1e-9, atol=0.0)
             for mine, theirs in zip(
@@ -65,7 +65,7 @@ class Channel:
         )
 
     def closed_loop(self, gain: complex, delay_s: float) -> npt.NDArray[Any]:
-        """The matrix of one period: states of the law, q, q', and the commands on their way."""
+        """The matrix of one period: states of the law, q, q', and the delayed commands."""
         n, period = len(self.C), self.period
         whole, fraction = split_delay(delay_s, period)
         old, new = _held(period, fraction)
@@ -101,7 +101,7 @@ class Channel:
 
     @cached_property
     def frequencies(self) -> FloatArray:
-        """Grid (rad/s) up to the Nyquist frequency, dense both ways."""
+        """Grid (rad/s) up to the Nyquist frequency, dense at both ends."""
         top = np.pi / self.period
         return np.unique(np.concatenate((np.geomspace(_LOWEST_RAD_S, top, 1200), np.linspace(0.0, top, 801)[1:])))
 
@@ -136,7 +136,7 @@ class Channel:
 
 
 def _root(function: Callable[[float], float], low: float, high: float) -> float:
-    """Where the function is zero between two places of opposite sign: regula falsi, by the Illinois rule, to rounding.
+    """The zero of a function between two points of opposite sign: regula falsi (Illinois), to rounding.
 
     As `scipy.optimize.brentq` finds it (a test holds that), without the half second that importing it adds to `run`.
     """
@@ -166,7 +166,7 @@ def split_delay(delay_s: float, period: float) -> tuple[int, float]:
 
 
 def _held(period: float, fraction: float) -> tuple[FloatArray, FloatArray]:
-    """What an old command, acting for `fraction` of the period, and the new one after it add to (q, q')."""
+    """The contribution to (q, q') of an old command, acting for `fraction` of the period, and of the new one after it."""
     rest = 1.0 - fraction
     return (
         np.array((0.5 * period**2 * (1.0 - rest**2), period * fraction)),
@@ -175,7 +175,7 @@ def _held(period: float, fraction: float) -> tuple[FloatArray, FloatArray]:
 
 
 def channels(scenario: Scenario) -> dict[str, Channel]:
-    """The linear loop of each axis, for the slope h of the gears. Raises UsageError for a law there is not."""
+    """The linear loop of each axis, for the slope h of the gears. Raises UsageError for an unknown law."""
     return channels_of(scenario, make_realisation(scenario.law, scenario))
 
 
@@ -233,7 +233,7 @@ def _border_gains(channel: Channel, delay_s: float, turn: complex, *, nyquist: b
     ]
     for i in change:
         if i == len(omega) - 2 and nyquist:
-            continue  # the imaginary part ends at zero there: rounding, and the border is taken below
+            continue  # there the imaginary part is zero by rounding; that boundary is handled below
         crossing = _root(lambda w: (turn * channel._loop_at(delay_s, w)).imag, omega[i], omega[i + 1])
         real = (turn * channel._loop_at(delay_s, crossing)).real
         if real < 0.0:
@@ -243,7 +243,7 @@ def _border_gains(channel: Channel, delay_s: float, turn: complex, *, nyquist: b
 
 
 def range_around(intervals: list[tuple[float, float]], gain: float) -> tuple[float, float] | None:
-    """The interval that holds the gain; else the nearest one; None where there is none."""
+    """The interval that contains the gain; else the nearest one; None where there are no intervals."""
 
     def distance(interval: tuple[float, float]) -> float:
         low, high = interval
@@ -263,10 +263,10 @@ def crossovers(channel: Channel, gain: complex, delay_s: float) -> list[tuple[fl
 
 
 def largest_delay(channel: Channel, gain: complex) -> float | None:
-    """The largest total delay (s) up to which the loop stays stable; 0 where it is not even without; None: no limit.
+    """The largest total delay (s) up to which the loop stays stable; 0 where it is unstable without delay; None: no limit.
 
-    A Newton iteration on the phase margin proposes it, eigenvalues on both sides, 0.02 periods off, and along the way
-    confirm it; where they do not, a bisection on the eigenvalues finds it to a hundredth of a period.
+    A Newton iteration on the phase margin estimates it; eigenvalues 0.02 periods to both sides and at smaller delays
+    confirm it; if they do not, a bisection on the eigenvalues finds it to a hundredth of a period.
     """
     if not channel.stable(gain, 0.0):
         return 0.0
@@ -295,13 +295,13 @@ def largest_delay(channel: Channel, gain: complex) -> float | None:
 
 
 def _proposed_delay(channel: Channel, gain: complex) -> float | None:
-    """Where the smallest phase margin vanishes, if an iteration finds it."""
+    """The delay at which the smallest phase margin vanishes, if the iteration converges."""
     delay = 0.0
     for _ in range(25):
         margins = crossovers(channel, gain, delay)
         if not margins:
             return None
-        # Without delay the margin is what is left of the way down; later it may have either sign.
+        # Without delay the margin is counted downwards only; later it may have either sign.
         steps = [(margin % (2.0 * np.pi) if delay == 0.0 else margin) / omega for omega, margin in margins]
         step = min(steps, key=abs)
         delay += step

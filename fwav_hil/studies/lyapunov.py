@@ -2,9 +2,9 @@
 
     q_z = q_e' + Lambda q_e (11)    V_1 = q_z^2 / 2 (22)    u~ = q_z' + K q_z    rho_1 = 2 K - 1 (27)    C_1 = u~^2 / 2 (28)
 
-u~ is taken from the run itself: with the law's extra pole (24) holds only about, so u_d - uhat is not exactly this. The
-paper treats C_1 as a constant, for which its largest value so far stands here: V_1(t) <= V_1(0) + max C_1 / rho_1 (30). That
-is soon dominated by the start. What (26) itself says, V_1' <= -rho_1 V_1 + C_1(t), bounds V_1 closer, by comparison with
+u~ is computed from the run: with the law's extra pole (24) holds only approximately, so u_d - uhat is not exactly u~. The
+paper treats C_1 as a constant; here it is its largest value so far: V_1(t) <= V_1(0) + max C_1 / rho_1 (30). This
+is soon dominated by the start. (26) itself, V_1' <= -rho_1 V_1 + C_1(t), gives a tighter bound, by comparison with
 y' = -rho_1 y + C_1(t), y(0) = V_1(0).
 """
 

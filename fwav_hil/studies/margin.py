@@ -1,7 +1,7 @@
-"""Will these gains stand this link? The margins of each channel, the delay budget of a run, and a verdict.
+"""Are these gains stable on this link? The margins of each channel, the delay budget of a run, and a verdict.
 
 The linear figures come from `loop_model`, those with the hysteresis from `describing`, the check on the whole plant from
-`flight_check`. Here they are put together; `docs/margins.md` says how to read them.
+`flight_check`. They are combined here; `docs/margins.md` explains them.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ class ChannelMargin(msgspec.Struct, frozen=True, kw_only=True):
     """The linear loop of one channel at one delay, for the slope h of its gear.
 
     gain_ratio         g/b, the true input gain over the law's
-    gain_range         g/b from where to where the loop is stable: the range around gain_ratio, or the nearest one; None: none
+    gain_range         range of g/b in which the loop is stable: around gain_ratio, or the nearest one; None: no such range
     gain_margin        the smaller of the two below; under 1 where unstable; 0: no gain is stable
-    gain_margin_up     by which factor the gain may grow; None: by any
-    gain_margin_down   by which it may shrink; None: by any
-    phase_margin_rad   smallest turn of the loop at a crossover that takes it to its border; negative where unstable
-    crossover_rad_s    the frequency where that is, |L| = 1
-    max_delay_s        largest total delay, sample to action; 0: unstable without any; None: no limit within 600 periods
+    gain_margin_up     factor by which the gain may grow; None: any
+    gain_margin_down   factor by which it may shrink; None: any
+    phase_margin_rad   smallest phase shift at a crossover that makes the loop marginal; negative where unstable
+    crossover_rad_s    the frequency of that crossover, |L| = 1
+    max_delay_s        largest total delay, sample to action; 0: unstable without delay; None: no limit within 600 periods
     """
 
     gain_ratio: float
@@ -89,7 +89,7 @@ def _finite(value: float | None) -> float | None:
 
 
 def linear_margins(scenario: Scenario) -> dict[str, ChannelMargin]:
-    """The margins of all six channels at the delay of the scenario. Raises UsageError for a law there is not."""
+    """The margins of all six channels at the delay of the scenario. Raises UsageError for an unknown law."""
     loops = channels(scenario)
     delay_s = scenario.delay_ns / NANOSECONDS
     margins: dict[str, ChannelMargin] = {}
@@ -122,7 +122,7 @@ def with_derivative_pole(scenario: Scenario, pole: float) -> Scenario:
 def at_rate(scenario: Scenario, rate_hz: float) -> Scenario:
     """The scenario at another rate, with the longest step of the integrator that fits and is no longer than its own.
 
-    Raises ScenarioError for a rate that makes no sense.
+    Raises ScenarioError for an invalid rate.
     """
     substep_s = scenario.substep_s
     if 0.0 < rate_hz <= 1e6 and (period_ns := round(NANOSECONDS / rate_hz)) % 1000 == 0:
@@ -134,7 +134,7 @@ def at_rate(scenario: Scenario, rate_hz: float) -> Scenario:
 
 
 class Budget(msgspec.Struct, frozen=True, kw_only=True):
-    """What a link takes of the delay that the loaded gains stand.
+    """The share of the largest stable delay that a link uses.
 
     max_delay_s   smallest over the channels (s); None: no limit; `channel` is where it is
     delay_s       of this link and rate: the scenario's, or in real time one period, the most that an answer in time takes
@@ -160,13 +160,13 @@ def budget_line(scenario: Scenario, clock: str = "lockstep") -> Budget:
     period_s = scenario.period_ns / NANOSECONDS
     if clock == "realtime":
         delay_s = period_s
-        taken = f"an answer in time takes up to a period, {_ms(delay_s)}"
+        taken = f"an answer in time takes up to one period, {_ms(delay_s)}"
     else:
         delay_s = scenario.delay_ns / NANOSECONDS
         samples = f"{scenario.delay.samples} sample{'s' if scenario.delay.samples != 1 else ''}"
-        taken = f"this link takes {_ms(delay_s)} ({samples} at {scenario.rate_hz:g} Hz + {_ms(scenario.delay.seconds)})"
+        taken = f"this link's delay is {_ms(delay_s)} ({samples} at {scenario.rate_hz:g} Hz + {_ms(scenario.delay.seconds)})"
         if delay_s == 0.0:
-            taken = "this link takes none of it"
+            taken = "this link has no delay"
     head = f"delay budget ({scenario.law}, {scenario.rate_hz:g} Hz): "
     if not bounded:
         return Budget(
@@ -175,16 +175,16 @@ def budget_line(scenario: Scenario, clock: str = "lockstep") -> Budget:
             delay_s=delay_s,
             left_s=None,
             warn=False,
-            sentence=f"{head}the linear loop stands any delay; {taken}",
+            sentence=f"{head}the linear loop is stable at any delay; {taken}",
         )
     axis = min(bounded, key=lambda one: bounded[one])
     most = bounded[axis]
     left = most - delay_s
     warn = left < WARN_BELOW * most or most == 0.0
     if most == 0.0:
-        sentence = f"{head}the gains are unstable without any delay ({AXIS_NAMES[axis]})"
+        sentence = f"{head}the gains are unstable even without delay ({AXIS_NAMES[axis]})"
     else:
-        sentence = f"{head}the gains stand {_ms(most)} ({AXIS_NAMES[axis]}), {taken}, "
+        sentence = f"{head}the gains are stable up to {_ms(most)} ({AXIS_NAMES[axis]}), {taken}, "
         sentence += f"{_ms(left)} left" if left >= 0.0 else f"{_ms(-left)} too much: unstable"
     if warn:
         why = "" if most == 0.0 or left < 0.0 else ": less than a third"
@@ -254,7 +254,7 @@ def judge(
         if gain is not None and gain < LEAST_GAIN_MARGIN:
             reasons.append(f"the gain margin of {AXIS_NAMES[axis]} is {gain:.2f}")
         if most is not None and most < LEAST_DELAY_MARGIN * delay_s:
-            reasons.append(f"{AXIS_NAMES[axis]} stands {most / delay_s:.2f} times the delay")
+            reasons.append(f"{AXIS_NAMES[axis]} is stable up to {most / delay_s:.2f} times the delay only")
     if flown_delay_s is not None and flown_delay_s < LEAST_DELAY_MARGIN * delay_s:
-        reasons.append(f"the flown loop stands {flown_delay_s / delay_s:.2f} times the delay")
+        reasons.append(f"flights are lost beyond {flown_delay_s / delay_s:.2f} times the delay")
     return Verdict("thin" if reasons else "good", tuple(reasons))

@@ -35,10 +35,10 @@ def margin_command(
     ] = None,
     json_path: JsonPath = None,
 ) -> None:  # fmt: skip
-    """Say whether the gains of SCENARIO stand its link: margins of gain, phase and delay, then the same flown.
+    """Compute whether the gains of SCENARIO are stable on its link: margins of gain, phase and delay, then in simulated flight.
 
     Verdict: good; thin (a gain margin under 2, or a largest delay under twice the loop's); unusable (unstable, or the flight
-    is lost). A command that ran to its end exits with 0, whatever the verdict.
+    is lost). A command that ran to its end exits with 0 for every verdict.
     """
     from rich.console import Console
     from rich.progress import Progress
@@ -59,7 +59,7 @@ def margin_command(
     if out:
         require("plots")
         if (out / RESULT).exists():
-            raise RunFolderError(f"{out} holds a margin study already, which stays: choose another folder with --out")
+            raise RunFolderError(f"{out} already holds a margin study: choose another folder with --out")
         make_folder(out)
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task("margins", total=STEPS)

@@ -1,4 +1,4 @@
-"""The figures of the margin study, as PNG: stability regions, describing function, what a gear does at a reversal."""
+"""The figures of the margin study, as PNG: stability regions, describing function, a gear at a reversal."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def _fill(panel: Any, region: Region, ratio: float) -> tuple[float, float]:
     ends = [end for intervals in region.intervals for pair in intervals for end in pair if 0.0 < end < np.inf]
     bottom, top = 0.7 * min([ratio, *ends]), 2.5 * max([ratio, *ends])
     delays = 1e3 * region.delay_s
-    # An interval stands for the stretch of delays around it; neighbours of one piece are drawn as one.
+    # An interval represents the delays around it; overlapping neighbours are drawn as one area.
     most = max((len(intervals) for intervals in region.intervals), default=0)
     for number in range(most):
         low = np.full(len(delays), np.nan)
@@ -107,7 +107,7 @@ def draw_describing_function(path: Path, gear: Gear) -> Path:
 
 
 def draw_reversal(path: Path, gear: Gear) -> Path:
-    """u against tau along a long stroke, its reversal, and the way back; slopes h and the one after the reversal."""
+    """u against tau along a long stroke, its reversal, and the return; the slopes h and just after the reversal."""
     tau = gear.amplitude * np.concatenate((np.linspace(0.0, 8.0, 400), np.linspace(8.0, 0.0, 400)[1:]))
     u = _follow(gear, tau)
     figure = Figure(figsize=(7.0, 4.2), layout="constrained")

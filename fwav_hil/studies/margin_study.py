@@ -1,4 +1,4 @@
-"""The whole margin study of a scenario: linear, with the describing function, flown; as one result."""
+"""The complete margin study of a scenario: linear, with the describing function, flown; as one result."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _KICK = 10.0
 
 
 class AmplitudeRow(msgspec.Struct, frozen=True, kw_only=True):
-    """A channel at one amplitude of tau (N, N m), N(A) in the place of h: |N|/h, its lag, and what margins that leaves."""
+    """A channel at one amplitude of tau (N, N m), N(A) in place of h: |N|/h, its lag, and the resulting margins."""
 
     amplitude: float
     relative_gain: float
@@ -50,7 +50,7 @@ class Region(NamedTuple):
 
 
 class Study(NamedTuple):
-    """All of it. Dictionaries are by axis; `groups` lists axes whose loops are the same, one tuple each."""
+    """The result. Dictionaries are by axis; `groups` lists axes whose loops are the same, one tuple each."""
 
     scenario: Scenario
     groups: list[tuple[str, ...]]
@@ -71,11 +71,11 @@ class Study(NamedTuple):
 
 
 STEPS = 5 + len(RATES_HZ) + len(VARIANTS)
-"""How often `progress` is called."""
+"""The number of calls of `progress`."""
 
 
 def study(scenario: Scenario, progress: Callable[[str], None] = lambda _text: None) -> Study:
-    """Everything `fwav-hil margin` shows; `progress` is told what comes next. Raises UsageError for an unknown law."""
+    """Everything `fwav-hil margin` shows; `progress` is called with the next step. Raises UsageError for an unknown law."""
     progress("linear margins")
     loops = channels(scenario)
     worn = dict(zip(AXES, gears(scenario.hysteresis), strict=True))
@@ -129,7 +129,7 @@ def _amplitude_rows(channel: Channel, gear: Gear, delay_s: float) -> list[Amplit
     for amplitude in amplitudes(gear, _AMPLITUDES):
         relative = describing_function(gear, float(amplitude)) / gear.h
         if abs(relative) < 1e-9:
-            continue  # within its play a gear passes nothing on
+            continue  # within its play a gear's output is zero
         margin = channel_margin(channel, delay_s, complex(channel.ratio * relative))
         rows.append(
             AmplitudeRow(
@@ -154,7 +154,7 @@ def _region(channel: Channel, delay_s: float, most: float | None) -> Region:
 
 
 def _kick(cycles: dict[str, list[LimitCycle]]) -> FloatArray:
-    """How far off to let go: well above every predicted cycle, 1 mm or .6 degrees where there is none."""
+    """The initial offset: well above every predicted limit cycle, 1 mm or .6 degrees where there is none."""
     kick = np.repeat((1e-3, 1e-2), 3)
     for i, axis in enumerate(AXES):
         kick[i] = max((_KICK * cycle.motion for cycle in cycles[axis] if cycle.attracting), default=kick[i])

@@ -60,7 +60,7 @@ def _channel_table(result: Study, delay_s: float) -> Table:
 
 def _amplitude_table(result: Study) -> Table:
     table = _table(
-        "with the hysteresis: N(A) of its describing function in the place of h",
+        "with the hysteresis: N(A) of its describing function in place of h",
         "channels", "A of tau", "N/h", "lag", "gain margin up", "down", "phase margin", "largest delay",
     )  # fmt: skip
     for group in _tightest(result):
@@ -81,7 +81,7 @@ def _amplitude_table(result: Study) -> Table:
 
 
 def _tightest(result: Study) -> list[tuple[str, ...]]:
-    """Of the groups of position and of attitude the one each that stands least delay; the JSON has all."""
+    """The group of position and the group of attitude with the smallest largest delay; the JSON has all groups."""
     shown = []
     for axes in (AXES[:3], AXES[3:]):
         groups = [group for group in result.groups if group[0] in axes]
@@ -156,7 +156,7 @@ def _print_difference(console: Console, result: Study) -> None:
         single = {name: gain for name, gain in list(gains.items())[:-1] if gain > 0.05 * flown.max_delay_s}
         if single:
             most = max(single, key=lambda name: single[name])
-            console.print(f"what makes the difference most: {most} would give {_ms(single[most])} more")
+            console.print(f"largest single cause of the difference: {most} would give {_ms(single[most])} more")
     if flown.why_lost:
         console.print(f"beyond {_ms(flown.max_delay_s)}: {flown.why_lost}")
 

@@ -1,4 +1,4 @@
-"""The source paper's section IV, run again: its tables beside ours, its claims judged cell by cell.
+"""Section IV of the source paper, reproduced: its tables beside ours, its claims checked cell by cell.
 
 Conditions are simulated in process (`fwav_hil.simulate`), at the scenario's rate and duration; errors are in the paper's
 units, cm and rad, over the whole run, as in (34) and (35).
@@ -33,7 +33,7 @@ MEASURES = ("rmse", "mae")
 
 
 class Condition(NamedTuple):
-    """One column of a table: the paper's table and name for it, the law, and what is changed in which table of its gains."""
+    """One column of a table: the paper's table and name for it, the law, and the changes to its tables of gains."""
 
     table: str
     name: str
@@ -48,7 +48,7 @@ class Condition(NamedTuple):
 
 
 def conditions(base: Scenario) -> tuple[Condition, ...]:
-    """Every column of tables II, III and IV, and two of our own (table "-") that the paper has no numbers for."""
+    """Every column of tables II, III and IV, and two of our own (table "-") for which the paper has no numbers."""
     gains = base.read_gains("ude", UdeGains)
     products = tuple(k * lam / b for k, lam, b in zip(gains.K, gains.Lambda, base.control.b, strict=True))
     sums = tuple((k + lam) / b for k, lam, b in zip(gains.K, gains.Lambda, base.control.b, strict=True))
@@ -80,7 +80,7 @@ class Row(msgspec.Struct, frozen=True):
 
 
 class Claim(msgspec.Struct, frozen=True):
-    """An ordering that the paper states, for one channel and measure: held by its own numbers? by ours?"""
+    """An ordering that the paper states, for one channel and measure: whether its own numbers hold it, and ours."""
 
     scenario: str
     claim: str
@@ -91,7 +91,7 @@ class Claim(msgspec.Struct, frozen=True):
 
 
 class Flight(NamedTuple):
-    """A condition as it was flown."""
+    """A condition and its flight."""
 
     condition: Condition
     scenario: Scenario
@@ -104,9 +104,9 @@ def fly_all(
     fly: Callable[[Scenario], Simulation] = simulate,
     flown: Sequence[Condition] | None = None,
 ) -> Iterator[Flight]:
-    """Fly the conditions of a scenario (every one, where not told which) by `fly`; conditions that are the same, once.
+    """Fly the conditions of a scenario (by default all) by `fly`; identical conditions are flown once.
 
-    `progress` is told the name of each before it starts.
+    `progress` is called with the name of each before it starts.
     """
     results: list[tuple[Scenario, Simulation]] = []
     for condition in conditions(base) if flown is None else flown:
@@ -120,12 +120,12 @@ def fly_all(
 
 
 def conditions_on_the_wire(base: Scenario) -> list[Condition]:
-    """The conditions that a link can carry: all but state feedback."""
+    """The conditions that can be flown over a link: all except state feedback."""
     return [c for c in conditions(base) if not make_law(c.law, c.scenario(base)).needs_velocity]
 
 
 def fly_on_the_wire(scenario: Scenario) -> Simulation:
-    """Fly a scenario as two processes in lockstep; the recording is then thrown away. Raises what `run` raises."""
+    """Fly a scenario as two processes in lockstep; the recording is then deleted. Raises what `run` raises."""
     with tempfile.TemporaryDirectory(prefix="fwav-hil-") as temporary:
         folder = new_folder(scenario, Path(temporary) / "run")
         summary = run(scenario, folder, RunOptions(link="udpin://127.0.0.1:0", show_progress=False))
@@ -187,7 +187,7 @@ ORDERINGS = (
     ("T = 0.01 < T = 0.1", "IV", "T=0.01", "T=0.1"),
     ("T = 0.1 < T = 1", "IV", "T=0.1", "T=1"),
 )
-"""What the text of section IV states of its tables: (claim, table, the smaller, the larger)."""
+"""What the text of section IV claims about its tables: (claim, table, the smaller, the larger)."""
 
 
 def judge(rows: list[Row]) -> list[Claim]:

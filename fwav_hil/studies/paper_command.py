@@ -30,11 +30,11 @@ def paper_command(
     ] = Path("paper_study"),
     wire: Annotated[bool, Option(
         "--wire",
-        "Fly as two processes in lockstep instead of in this one, and compare with it; no state feedback there."
+        "Fly as two processes in lockstep, and compare with the in-process simulation; without state feedback."
     )] = False,
     json_path: JsonPath = None,
 ) -> None:  # fmt: skip
-    """Run the source paper's section IV again: tables II-IV, figures 3-8, its claims judged cell by cell."""
+    """Reproduce section IV of the source paper: tables II-IV, figures 3-8, its claims checked cell by cell."""
     from rich.console import Console
     from rich.progress import Progress
 

@@ -80,7 +80,7 @@ def draw_hysteresis(folder: Path) -> list[Path]:
 
 
 def draw_lyapunov(folder: Path, flight: Flight) -> Path:
-    """V_1 and its bound (30), per axis."""
+    """Plot V_1 and its bound (30), per axis."""
     bound = lyapunov(flight.scenario, flight.result)
     figure = Figure(figsize=(13.0, 7.0), layout="constrained")
     FigureCanvasAgg(figure)

@@ -74,7 +74,7 @@ def test_one_that_a_signal_ended_is_started_again_and_the_emulator_is_told(
     assert children == [first, drives_of(keeper)]
     assert emulator.signals == [signal.SIGURG]
     assert keeper.failure is None
-    assert "was ended by signal 9: started again (1 of 3)" in capsys.readouterr().err
+    assert "was ended by signal 9: restarted (1 of 3)" in capsys.readouterr().err
 
 
 def test_a_few_times_only(keeper: MotorKeeper, emulator: Process) -> None:
@@ -88,8 +88,8 @@ def test_a_few_times_only(keeper: MotorKeeper, emulator: Process) -> None:
     assert drives_of(keeper) is last
     assert len(emulator.signals) == MOST_RESTARTS
     assert keeper.failure == (
-        "the process of the drives was ended by signal 11, started again 3 times before, and the run with it: "
-        "see what ends it, and fly again"
+        "the process of the drives was ended by signal 11 after 3 restarts, which ended the run: "
+        "find out what ends it, then run again"
     )
 
 
@@ -106,7 +106,9 @@ def test_one_that_failed_says_why_itself(keeper: MotorKeeper, emulator: Process)
 def test_one_that_somebody_else_ended_is_named(keeper: MotorKeeper, emulator: Process) -> None:
     drives_of(keeper).code = 0
     look(keeper, emulator)
-    assert keeper.failure == "the process of the drives ended, and the run with it: see what ends it, and fly again"
+    assert (
+        keeper.failure == "the process of the drives ended, which ended the run: find out what ends it, then run again"
+    )
 
 
 def test_one_whose_run_is_over_is_asked_to_end_once_and_is_no_failure(keeper: MotorKeeper, emulator: Process) -> None:

@@ -191,7 +191,7 @@ class TestFromAFolder:
         assert {file.name for file in out.iterdir()} == {"latency.json", "latency.png", "latency_age.hgrm"}
         capsys.readouterr()
         assert latency("--from", folder, "--out", out) == 6
-        assert_one_line(capsys.readouterr().err, "holds a latency report already")
+        assert_one_line(capsys.readouterr().err, "already holds a latency report")
 
     def test_known_stamps_come_out_as_they_are(self, folder: Path, tmp_path: Path) -> None:
         save(stamps(100), folder)
@@ -227,11 +227,11 @@ class TestWrongArguments:
         ("arguments", "words"),
         [
             (["--controller-from", "."], ["--controller-from", "--from"]),
-            (["--from", ".", "--against"], ["--against would do nothing"]),
-            (["--from", ".", "flapper"], ["SCENARIO would do nothing"]),
-            (["--from", ".", "--delay", "5ms"], ["--delay would do nothing"]),
-            (["--link", "udpout://127.0.0.1:9", "--law", "pd"], ["--law would do nothing"]),
-            (["--link", "udpout://127.0.0.1:9", "--delay", "1ms"], ["--delay would do nothing"]),
+            (["--from", ".", "--against"], ["--against has no effect"]),
+            (["--from", ".", "flapper"], ["SCENARIO has no effect"]),
+            (["--from", ".", "--delay", "5ms"], ["--delay has no effect"]),
+            (["--link", "udpout://127.0.0.1:9", "--law", "pd"], ["--law has no effect"]),
+            (["--link", "udpout://127.0.0.1:9", "--delay", "1ms"], ["--delay has no effect"]),
             (["--link", "udpout://127.0.0.1:9", "--rate", "0"], ["0 questions a second", "--rate"]),
             (["--link", "udpout://127.0.0.1:9", "--rate", "-5"], ["--rate"]),
             (["--link", "udpout://127.0.0.1:9", "--rate", "nan"], ["--rate"]),

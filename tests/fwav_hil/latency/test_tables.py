@@ -54,7 +54,7 @@ def test_timesync_says_whether_it_held() -> None:
     assert "within its bound of 8.0 us" in shown(print_report, report())
     sync = {"error_us": 9.0, "bound_us": 8.0, "answers": 12, "held": False}
     assert "BEYOND its bound" in shown(print_report, report(time_sync=sync))
-    assert "no answer came" in shown(print_report, report(time_sync=None))
+    assert "no answer;" in shown(print_report, report(time_sync=None))
     sync = {"offset_us": -5.5, "offset_at_end_us": 900.0, "bound_us": 8.0, "answers": 12}
     assert "ahead by -5.5 us at the start and 900.0 us at the end, within 8.0 us" in shown(
         print_report, report(time_sync=sync)
@@ -62,7 +62,7 @@ def test_timesync_says_whether_it_held() -> None:
 
 
 def test_negative_durations_are_not_hidden() -> None:
-    assert "13 durations came out negative" in shown(print_report, report(negative_legs=13))
+    assert "13 durations were negative" in shown(print_report, report(negative_legs=13))
 
 
 def test_what_stood_beside_it_has_rows_and_its_losses_are_said() -> None:
@@ -103,5 +103,5 @@ def test_probes_of_a_link() -> None:
     }
     text = shown(print_probes, result)
     assert "serial:///dev/x:921600 at 50 Hz" in text
-    assert "lost 1, duplicate 2, out of order 3, to no question 4" in text
+    assert "lost 1, duplicate 2, out of order 3, unrequested 4" in text
     assert "ahead by 12.5 us, within 99.0 us" in text

@@ -122,7 +122,7 @@ class TestDifference:
             assert axis["max"] == pytest.approx(np.abs(column).max(), rel=1e-6)
             assert axis["rms"] == pytest.approx(np.sqrt(np.mean(column**2)), rel=1e-6)
         assert fwav_hil(*arguments) == 6
-        assert "report holds a report already" in capsys.readouterr().err
+        assert "report already holds a report" in capsys.readouterr().err
 
     @staticmethod
     def _commands(run_folder: Path, name: str) -> np.typing.NDArray[np.float64]:
@@ -185,7 +185,7 @@ class TestTrouble:
     def test_a_log_without_samples_is_told(self, tmp_path: Path) -> None:
         with TlogWriter(tmp_path / "run.tlog") as log:
             log.write(0, FrameWriter(1, 1).seal(mapping.HEARTBEAT, b"\1"))
-        with pytest.raises(LogError, match="holds no sample"):
+        with pytest.raises(LogError, match="has no sample"):
             recorded_run(tmp_path, "flapper", None)
 
     def test_a_law_that_needs_velocities_is_refused(self, fwav_hil: Command, run_folder: Path, capsys: Any) -> None:

@@ -184,11 +184,11 @@ class TestTrouble:
     @pytest.mark.parametrize(
         ("arguments", "words"),
         [
-            ((), "say where to replay once"),
-            (("--to", "udpout://127.0.0.1:9", "--into", "controller"), "say where to replay once"),
-            (("--to", "udpout://127.0.0.1:9", "--to", "udpout://127.0.0.1:8"), "say where to replay once"),
-            (("--to", "udpout://127.0.0.1:9", "--speed", "0.05"), "0.05 is no speed"),
-            (("--to", "udpout://127.0.0.1:9", "--speed", "fast"), "fast is no speed"),
+            ((), "give one target"),
+            (("--to", "udpout://127.0.0.1:9", "--into", "controller"), "give one target"),
+            (("--to", "udpout://127.0.0.1:9", "--to", "udpout://127.0.0.1:8"), "give one target"),
+            (("--to", "udpout://127.0.0.1:9", "--speed", "0.05"), "0.05 is not a speed"),
+            (("--to", "udpout://127.0.0.1:9", "--speed", "fast"), "fast is not a speed"),
             (("--to", "udpout://127.0.0.1:9", "--from", "noon"), "--from noon is no time"),
             (("--to", "udpout://127.0.0.1:9", "--from", "99"), "no time of"),
             (("--to", "udpout://127.0.0.1:9", "--system", "9"), "no frame of"),
@@ -196,8 +196,11 @@ class TestTrouble:
             (("--into", "controller", "--from", "2", "--loop"), "--from has no effect without --to"),
             (("--to", "udpout://127.0.0.1:9", "--fast", "--law", "pd"), "--law has no effect without --into"),
             (("--to", "udpout://127.0.0.1:9", "--from", "0.4", "--types", "HEARTBEAT", "--loop"), "--loop: all frames"),
-            (("--into", "controller", "--realtime"), "--realtime is about keeping the time of a log"),
-            (("--to", "udpout://127.0.0.1:9", "--realtime", "--speed", "max"), "--realtime is about keeping the time"),
+            (("--into", "controller", "--realtime"), "--realtime applies only to a timed replay"),
+            (
+                ("--to", "udpout://127.0.0.1:9", "--realtime", "--speed", "max"),
+                "--realtime applies only to a timed replay",
+            ),
             (("--to", "udpout://127.0.0.1:9", "--signing-key", "nowhere"), "cannot read the signing key nowhere"),
         ],
     )

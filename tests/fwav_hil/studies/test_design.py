@@ -281,7 +281,7 @@ class TestCommand:
         assert result["file"] == str(out)
 
         assert run_command(cli, "fwav-hil", arguments) == 6
-        assert "exists already and stays" in capsys.readouterr().err
+        assert "already exists" in capsys.readouterr().err
 
     @pytest.mark.parametrize(
         ("arguments", "code", "words"),

@@ -150,8 +150,8 @@ class TestVerdict:
             ({"stable": False}, None, 0.025, "unusable", "linearly unstable in pitch"),
             ({}, "it fell", 0.0, "unusable", "it fell"),
             ({"gain_margin": 1.9}, None, 0.025, "thin", "gain margin of pitch is 1.90"),
-            ({"max_delay_s": 0.0199}, None, 0.025, "thin", "pitch stands 1.99 times the delay"),
-            ({}, None, 0.0199, "thin", "the flown loop stands 1.99"),
+            ({"max_delay_s": 0.0199}, None, 0.025, "thin", "pitch is stable up to 1.99 times the delay"),
+            ({}, None, 0.0199, "thin", "flights are lost beyond 1.99"),
             ({"max_delay_s": None, "gain_margin": None}, None, None, "good", ""),
         ],
     )
@@ -188,23 +188,23 @@ class TestBudget:
     def test_of_a_scenario_without_delay(self) -> None:
         budget = budget_line(scenario_of("paper"))
         assert (budget.delay_s, budget.left_s) == (0.0, budget.max_delay_s)
-        assert "this link takes none of it, 5.84 ms left" in budget.sentence
+        assert "this link has no delay, 5.84 ms left" in budget.sentence
 
     def test_in_real_time_the_link_is_the_delay(self) -> None:
         budget = budget_line(scenario_of("flapper"), "realtime")
         assert budget.delay_s == pytest.approx(0.004)
-        assert "an answer in time takes up to a period" in budget.sentence
+        assert "an answer in time takes up to one period" in budget.sentence
 
     def test_of_gains_that_are_unstable_without_delay(self) -> None:
         budget = budget_line(with_gain_ratio(scenario_of("flapper"), 40.0), "lockstep")
         assert (budget.max_delay_s, budget.warn) == (0.0, True)
-        assert "unstable without any delay" in budget.sentence
+        assert "unstable even without delay" in budget.sentence
 
     def test_of_a_loop_without_a_limit(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("fwav_hil.studies.margin.largest_delay", lambda *_: None)
         budget = budget_line(scenario_of("flapper"), "lockstep")
         assert (budget.max_delay_s, budget.left_s, budget.warn) == (None, None, False)
-        assert "stands any delay" in budget.sentence
+        assert "is stable at any delay" in budget.sentence
 
     def test_of_the_papers_gains_at_100_hz_is_all_but_used_up(self) -> None:
         budget = budget_line(scenario_of("paper", rate_hz=100.0), "lockstep")

@@ -79,7 +79,7 @@ def test_of_the_flapper(tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
 
     again = call(capsys, "flapper", "--out", str(out))
     assert again.code == 6
-    assert "holds a margin study already" in again.err
+    assert "already holds a margin study" in again.err
 
 
 def test_the_papers_gains_at_100_hz_are_unusable(
