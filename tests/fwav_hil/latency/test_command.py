@@ -232,7 +232,7 @@ class TestWrongArguments:
             (["--from", ".", "--delay", "5ms"], ["--delay has no effect"]),
             (["--link", "udpout://127.0.0.1:9", "--law", "pd"], ["--law has no effect"]),
             (["--link", "udpout://127.0.0.1:9", "--delay", "1ms"], ["--delay has no effect"]),
-            (["--link", "udpout://127.0.0.1:9", "--rate", "0"], ["0 questions a second", "--rate"]),
+            (["--link", "udpout://127.0.0.1:9", "--rate", "0"], ["0 TIMESYNC requests a second", "--rate"]),
             (["--link", "udpout://127.0.0.1:9", "--rate", "-5"], ["--rate"]),
             (["--link", "udpout://127.0.0.1:9", "--rate", "nan"], ["--rate"]),
             (["--link", "udpout://127.0.0.1:9", "--rate", "inf"], ["--rate"]),
@@ -335,7 +335,7 @@ class TestARealLink:
             silent.bind(("127.0.0.1", 0))
             link = f"udpout://127.0.0.1:{silent.getsockname()[1]}"
             assert latency("--link", link, "--rate", "100", "--duration", "0.1") == 4
-        assert_one_line(capsys.readouterr().err, "nobody", link, "10 TIMESYNC questions")
+        assert_one_line(capsys.readouterr().err, "no answer", link, "10 TIMESYNC requests")
 
     def test_a_line_that_gives_back_what_is_sent_is_nobody(self, capsys: pytest.CaptureFixture[str]) -> None:
         master, slave = pty.openpty()
@@ -356,7 +356,7 @@ class TestARealLink:
             thread.join(PATIENCE_S)
             os.close(slave)
             os.close(master)
-        assert_one_line(capsys.readouterr().err, "nobody")
+        assert_one_line(capsys.readouterr().err, "no answer")
 
     def test_no_such_device_is_said(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert latency("--link", "serial:///dev/no-such-line:57600") == 3
