@@ -1,4 +1,4 @@
-"""What every file that grows while a run goes on does alike: unbuffered writes, closed once with the rest flushed."""
+"""Base of files that grow during a run: unbuffered writes; closing flushes the rest."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from protocol.errors import RunFolderError
 
 
 class AppendFile(abc.ABC):
-    """A file that is written to the system at each `flush`; `what` is how messages name it ("the log").
+    """A file that is written to the system at each `flush`; `what` is its name in error messages ("the log").
 
     Raises RunFolderError where it cannot be opened.
     """
@@ -29,7 +29,7 @@ class AppendFile(abc.ABC):
 
     @abc.abstractmethod
     def flush(self) -> None:
-        """Hand what is pending to the system. Raises RunFolderError."""
+        """Write pending data to the system. Raises RunFolderError."""
 
     def close(self) -> None:
         """Flush and close; may be called again."""

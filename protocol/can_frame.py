@@ -1,7 +1,7 @@
-"""A frame of the CAN bus, free of any interface, and how many bits it takes on the wire.
+"""A CAN frame, independent of any interface, and how many bits it takes on the wire.
 
 Bits of a classical frame (ISO 11898-1; Robert Bosch, CAN specification 2.0): start, identifier, control, data and a CRC of
-15 bits are stuffed, one opposite bit after each five equal ones; delimiters, acknowledge, end of frame and the three bits
+15 bits are stuffed: one opposite bit after each five equal ones. Delimiters, acknowledge, end of frame and the three bits
 between frames are not.
 
     standard    47 + 8 n bits, of which 34 + 8 n can be stuffed        extended    67 + 8 n, of which 54 + 8 n
@@ -20,7 +20,7 @@ EXTENDED_IDS = 1 << 29
 
 
 class CanFrame(NamedTuple):
-    """A classical CAN frame. `remote`: a remote transmission request, whose data are empty."""
+    """A classical CAN frame. `remote`: a remote transmission request, which has no data."""
 
     can_id: int
     data: bytes = b""
@@ -33,11 +33,11 @@ class CanFrame(NamedTuple):
 
 
 def nominal_bits(length: int, *, extended: bool) -> int:
-    """Bits of a frame with `length` bytes of data without any stuffing, the gap to the next frame included."""
+    """Bits of a frame with `length` bytes of data without stuffing, including the gap to the next frame."""
     return (67 if extended else 47) + 8 * length
 
 
 def worst_bits(length: int, *, extended: bool) -> int:
-    """Bits of a frame with `length` bytes of data at the most stuffing that any content can cause."""
+    """Bits of a frame with `length` bytes of data with the most stuffing that any content can cause."""
     stuffable = (54 if extended else 34) + 8 * length
     return nominal_bits(length, extended=extended) + (stuffable - 1) // 4

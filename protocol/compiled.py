@@ -1,4 +1,4 @@
-"""Compiled kernels (numba), and the packed arguments that they take."""
+"""Compiled kernels (numba), and their packed arguments."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from numba.core import caching
 from protocol.kernel_cache import kernel_folder
 
 Packed: TypeAlias = npt.NDArray[np.void]
-"""A structured array of shape (1,), as `pack` makes them."""
+"""A structured array of shape (1,), as made by `pack`."""
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 
 def _load_numpy_support() -> None:
-    """Load numba's support of NumPy, which it needs for every kernel, without SciPy's linear algebra.
+    """Load numba's NumPy support, which every kernel needs, without SciPy's linear algebra.
 
-    It would be imported only to see whether there is a BLAS, for `np.convolve` in kernels: a third of a second at every
-    start. No kernel here has one.
+    numba imports that only to check for a BLAS, for `np.convolve` in kernels, which no kernel here uses: this saves a third
+    of a second at every start.
     """
     name = "scipy.linalg.cython_blas"
     if name in sys.modules or "numba.np.arraymath" in sys.modules:
         return
-    sys.modules[name] = None  # type: ignore[assignment]  # this is how importing it is made to fail
+    sys.modules[name] = None  # type: ignore[assignment]  # makes its import fail
     try:
         importlib.import_module("numba.np.arraymath")
     finally:
@@ -44,17 +44,17 @@ _load_numpy_support()
 
 
 def compiled(function: Kernel) -> Kernel:
-    """Compile `function` with numba when it is first called, and keep the result in the cache (`kernel_cache`).
+    """Compile `function` with numba at its first call, and store the result in the cache (`kernel_cache`).
 
-    No fast-math: the same expression must give the same bits in the control process and in `simulate`.
+    Without fast-math: the same expression must give bit-identical results in the control process and in `simulate`.
     """
     return _compile(function, forceinline=False)
 
 
 def inlined(function: Kernel) -> Kernel:
-    """As `compiled`, but part of each kernel that calls it.
+    """As `compiled`, but inlined into each kernel that calls it.
 
-    For the innermost loops: a call that hands arrays over costs as much as copying a short frame.
+    For the innermost loops: a call with array arguments takes as long as copying a short frame.
     """
     return _compile(function, forceinline=True)
 
@@ -62,24 +62,24 @@ def inlined(function: Kernel) -> Kernel:
 def _compile(function: Kernel, *, forceinline: bool) -> Kernel:
     kernel: Any = numba.njit(error_model="numpy", forceinline=forceinline)(function)
     make_cache: Any = _Cache
-    kernel._cache = make_cache(function)  # what `cache=True` sets, with folders of our own
+    kernel._cache = make_cache(function)  # as `cache=True` does, but in our own folders
     return cast("Kernel", kernel)
 
 
 class _Locator(caching._CacheLocator):
-    """Where the machine code of one function lies: in the folder of its module's key, so it is never stale."""
+    """Location of the machine code of one function: in the folder of its module's key, so it is never stale."""
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
         self._folder = kernel_folder(function.__module__, file)
         self._line = function.__code__.co_firstlineno
-        self._py_file = file  # numba names it in warnings
+        self._py_file = file  # numba shows it in warnings
 
     @classmethod
     def from_function(cls, function: Callable[..., Any], file: str) -> _Locator | None:
         return cls(function, file) if Path(file).exists() else None
 
     def ensure_cache_path(self) -> None:
-        self._folder.mkdir(mode=0o700, exist_ok=True)  # another process may have tidied it up
+        self._folder.mkdir(mode=0o700, exist_ok=True)  # another process may have removed it
 
     def get_cache_path(self) -> str:
         return str(self._folder)
@@ -96,7 +96,7 @@ class _Implementation(caching.CompileResultCacheImpl):
 
 
 class _Cache(caching.FunctionCache):
-    """numba's cache of one function; it bears with damaged entries, full disks, and processes that compile at once."""
+    """numba's cache of one function, tolerant of damaged entries, full disks and processes that compile concurrently."""
 
     _impl_class = _Implementation
 
@@ -105,18 +105,18 @@ class _Cache(caching.FunctionCache):
         flush: Any = self.flush
         try:
             return load(signature, target)
-        except Exception:  # noqa: BLE001  # whatever unpickling raises: the machine lost power while it was written, say
+        except Exception:  # noqa: BLE001  # any error of unpickling, for example after a power loss during the write
             with contextlib.suppress(OSError):
                 flush()
             return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
         save: Any = super().save_overload
-        with contextlib.suppress(OSError):  # what cannot be kept is compiled again
+        with contextlib.suppress(OSError):  # a kernel that cannot be stored is compiled again
             self._impl.locator.ensure_cache_path()
             with (Path(self.cache_path) / "lock").open("w") as lock:
-                with contextlib.suppress(OSError):  # there are network file systems without locks
-                    fcntl.flock(lock, fcntl.LOCK_EX)  # two that add to one index at a time could choose the same name
+                with contextlib.suppress(OSError):  # some network file systems have no locks
+                    fcntl.flock(lock, fcntl.LOCK_EX)  # two concurrent additions to an index could choose the same name
                 save(signature, result)
 
 
@@ -124,9 +124,9 @@ class _Cache(caching.FunctionCache):
 def _structure(
     kinds: tuple[tuple[str, str, tuple[int, ...]], ...], messages: tuple[tuple[str, np.dtype[np.void]], ...]
 ) -> np.dtype[np.void]:
-    """One dtype object for each layout: numba knows the one it has met at once, but compares an equal one field by field.
+    """One dtype object per layout: numba recognises the same object at once, but compares an equal one field by field.
 
-    That costs some microseconds for each argument of each call.
+    That would take some microseconds for each argument of each call.
     """
     columns = [(name, np.dtype((kind, shape))) for name, kind, shape in kinds]
     offsets = np.cumsum([0, *(kind.itemsize for _, kind in columns)]).tolist()
@@ -141,11 +141,11 @@ def _structure(
 
 
 def pack(values: Mapping[str, Any], messages: Mapping[str, np.dtype[np.void]] | None = None) -> Packed:
-    """Arrays, numbers and truth values by name, copied into one structured array of shape (1,).
+    """Arrays, numbers and booleans by name, copied into one structured array of shape (1,).
 
-    A kernel that is called from Python takes one array at once far sooner than a dozen. Inside a kernel `packed[0]` is
-    read by the same names as a NamedTuple's fields, so a function takes either. A message NAME (the dtype of its payload) is
-    there as NAME, field by field, and as NAME_bytes.
+    Calling a kernel from Python is much faster with one array than with a dozen. Inside a kernel the fields of `packed[0]`
+    are read like those of a NamedTuple, so a function accepts both. A message NAME (the dtype of its payload) is accessible
+    by field as NAME, and as bytes as NAME_bytes.
     """
     columns = [(name, np.asarray(value)) for name, value in values.items()]
     kinds = tuple((name, "i8" if array.dtype == bool else array.dtype.str, array.shape) for name, array in columns)

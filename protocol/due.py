@@ -4,13 +4,13 @@ from __future__ import annotations
 
 NANOSECONDS = 1_000_000_000
 NEVER = 1 << 62
-"""A time in ns that does not come."""
+"""A time in ns that is never reached."""
 
 
 class Due:
-    """Says when something periodic is due, in the time it is asked with: first at once, then each period.
+    """Schedule of a periodic event, in the time passed to `at`: due at once, then every period.
 
-    next_ns   until then it is not due
+    next_ns   when it is due next
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -18,7 +18,7 @@ class Due:
         self.next_ns = 0
 
     def at(self, t_ns: int) -> bool:
-        """Whether it is due at `t_ns`; asking so also marks it as done."""
+        """Whether it is due at `t_ns`; if so, this also schedules the next one."""
         if t_ns < self.next_ns:
             return False
         self.next_ns = (t_ns // self._period_ns + 1) * self._period_ns

@@ -1,11 +1,11 @@
-"""Where compiled kernels are kept, and whether they are there; numba is not loaded to know it.
+"""The folders of the compiled kernels, and whether they are complete; determined without loading numba.
 
-numba notices that a kernel's own file changed, but not that a kernel it calls in another file did. The kernels of a module
-are therefore kept in a folder that is named after the module's key: a digest of its source, of the sources of all modules
-of the project that it imports, directly or not, and of what compiles them. An edit there gives a new, empty folder, so
-no stale kernel is ever run; an edit anywhere else recompiles nothing.
+numba detects a change of a kernel's own file, but not of a kernel in another file that it calls. The kernels of a module
+are therefore stored in a folder named after the module's key: a digest of its source, of the sources of all modules
+of the project that it imports, directly or indirectly, and of the compiler's version and settings. An edit of these gives a
+new, empty folder, so a stale kernel is never run; an edit anywhere else recompiles nothing.
 
-What lies in these folders is code that will be run: a folder that another user owns or can write to is never used.
+These folders contain code that will be run: a folder that another user owns or can write to is never used.
 """
 
 from __future__ import annotations
@@ -38,29 +38,29 @@ _MOST_REMEMBERED = 5000
 
 
 class _Source(NamedTuple):
-    """The digest of a module's name and source, and the dotted names that it imports."""
+    """Digest of a module's name and source, and the dotted names that it imports."""
 
     digest: str
     imports: list[str]
 
 
 def kernels_are_warm(*packages: str) -> bool:
-    """Whether a start of these packages finds all that it needs compiled from the present sources; see `mark_warm`."""
+    """Whether all kernels for a start of these packages are compiled from the present sources; see `mark_warm`."""
     return all(mark.exists() for mark in _marks(packages))
 
 
 def mark_warm(*packages: str) -> None:
-    """Record that every kernel which a start of these packages needs is in the cache, until they or their imports change."""
-    with contextlib.suppress(OSError):  # a full disk, say: then the next start looks
+    """Record that all kernels for a start of these packages are in the cache, until they or their imports change."""
+    with contextlib.suppress(OSError):  # for example a full disk: then the next start checks again
         for mark in _marks(packages):
             mark.touch()
 
 
 @functools.cache
 def kernel_folder(module: str, file: str = "") -> Path:
-    """The folder of a module's compiled kernels; made where there is none.
+    """The folder of a module's compiled kernels; it is created if missing.
 
-    file   the module's source; needed only of a module outside the project
+    file   the module's source; needed only for a module outside the project
     """
     sources = _sources_of_project()
     if module not in sources:
@@ -78,7 +78,7 @@ def kernel_folder(module: str, file: str = "") -> Path:
 
 
 def _marks(packages: tuple[str, ...]) -> list[Path]:
-    """One file for each module with kernels that the packages hold or import: it says that these have been compiled."""
+    """One marker file for each module with kernels in the packages or their imports: these kernels have been compiled."""
     sources = _sources_of_project()
     within = tuple(f"{package}." for package in packages)
     reached = _closure((name for name in sources if f"{name}.".startswith(within)), sources)
@@ -87,7 +87,7 @@ def _marks(packages: tuple[str, ...]) -> list[Path]:
 
 
 def _closure(names: Iterable[str], sources: Mapping[str, _Source]) -> set[str]:
-    """Those of these names that are modules, all that they import, directly or not, and the packages that these are in."""
+    """The modules among `names`, all modules that they import, directly or indirectly, and the packages of these."""
     reached: set[str] = set()
     ahead = list(names)
     while ahead:
@@ -100,7 +100,7 @@ def _closure(names: Iterable[str], sources: Mapping[str, _Source]) -> set[str]:
 
 @functools.cache
 def _sources_of_project() -> dict[str, _Source]:
-    """Every module of the project. Parsing costs far more than reading: what a source imports is kept, by its digest."""
+    """All modules of the project. Parsing is much slower than reading, so the imports of a source are cached by digest."""
     kept = _cache_place() / "imports.json"
     try:
         known = msgspec.json.decode(kept.read_bytes(), type=dict[str, list[str]])
@@ -117,14 +117,14 @@ def _sources_of_project() -> dict[str, _Source]:
 
 
 def _sources_beside(module: str, file: Path) -> dict[str, _Source]:
-    """A module outside the project, and the others of its package; of a single file, the files beside it."""
+    """A module outside the project, with the other modules of its package, or the files beside a single file."""
     depth = module.count(".") + (file.name == "__init__.py")
     tops = [module.partition(".")[0]] if depth else [beside.stem for beside in file.parent.glob("*.py")]
     return {**_read_sources(file.parents[depth], tops, {}), module: _read_source(module, file, {})}
 
 
 def _read_sources(root: Path, tops: Iterable[str], known: Mapping[str, list[str]]) -> dict[str, _Source]:
-    """The modules in `root` that are named `tops`, or lie in a package of such a name."""
+    """The modules in `root` that are named in `tops`, or are in a package named there."""
     sources = {}
     for top in tops:
         if (root / f"{top}.py").is_file():
@@ -148,12 +148,12 @@ def _read_source(module: str, file: Path, known: Mapping[str, list[str]]) -> _So
 
 
 def _imported(package: str, source: bytes) -> list[str]:
-    """The dotted names, of modules and of things in modules, that a module in `package` imports while it is loaded."""
+    """The dotted names (of modules and of their members) that a module in `package` imports while it is loaded."""
     names: set[str] = set()
     try:
         ahead: list[ast.AST] = [ast.parse(source)]
     except SyntaxError:
-        return []  # importing it will say so
+        return []  # importing it will raise the error
     while ahead:
         node = ahead.pop()
         if isinstance(node, ast.Import):
@@ -170,14 +170,14 @@ def _imported(package: str, source: bytes) -> list[str]:
 
 @functools.cache
 def _compiler() -> str:
-    """What machine code depends on besides the source; numba itself looks at the processor's features once more."""
+    """Everything else that machine code depends on; numba itself also checks the processor's features."""
     versions = [version(name) for name in ("numba", "llvmlite", "numpy", "pymavlink")]
     settings = [f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith("NUMBA_")]
     return "\n".join([platform.python_version(), platform.machine(), *_processor(), *versions, *settings])
 
 
 def _processor() -> list[str]:
-    """Model and features of the first processor, where the system shows them in a file."""
+    """Model and features of the first processor, where the system provides them in a file."""
     try:
         first, _, _ = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").partition("\n\n")
     except OSError:
@@ -187,7 +187,7 @@ def _processor() -> list[str]:
 
 @functools.cache
 def _cache_place() -> Path:
-    """The user's cache; where that cannot be written, the system's temporary place; else one that ends with this process."""
+    """The user's cache; if not writable, the system's temporary folder; else a folder that is removed at exit."""
     for place in (
         Path(platformdirs.user_cache_dir("fwav-hil")),
         Path(tempfile.gettempdir()) / f"fwav-hil-{os.geteuid()}",
@@ -207,10 +207,10 @@ def _throwaway_place() -> Path:
 
 
 def _is_ours(folder: Path) -> bool:
-    """Whether the folder, made if need be and marked as used, belongs to this user, who alone can write to it."""
+    """Whether only this user owns and can write to the folder, which is created if missing and marked as used."""
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
-        status = folder.lstat()  # of a link itself: whoever made it could point it elsewhere later
+        status = folder.lstat()  # status of a symbolic link itself: its owner could change its target later
         os.utime(folder)
     except OSError:
         return False
@@ -219,8 +219,8 @@ def _is_ours(folder: Path) -> bool:
 
 
 def _forget_old(folder: Path, pattern: str) -> None:
-    """Remove the folders of older sources, keeping the few used last."""
-    with contextlib.suppress(OSError):  # another process may be tidying up at the same time
+    """Remove the folders of older sources, except the last used ones."""
+    with contextlib.suppress(OSError):  # another process may be removing them at the same time
         others = sorted((f for f in folder.parent.glob(pattern) if f != folder), key=lambda f: f.stat().st_mtime)
         for old in others[: -(_KEPT_FOLDERS - 1)]:
             shutil.rmtree(old, ignore_errors=True)

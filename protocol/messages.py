@@ -1,7 +1,7 @@
-"""What the two ends say to each other, free of any wire format.
+"""The messages between the two ends, independent of any wire format.
 
-Axes are always in the order x, y, z, alpha, beta, gamma: position in the inertial frame (north, east, down; m), then
-roll, pitch, yaw (rad); generalised forces are body forces (N), then body torques (N m).
+The axes are always in the order x, y, z, roll, pitch, yaw (`AXES` names the angles alpha, beta, gamma, as in the paper):
+position in the inertial frame (north, east, down; m), attitude (rad); generalised forces: body force (N), body torque (N m).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import msgspec
 
-if TYPE_CHECKING:  # `--help` needs this module, and is there before numpy would be
+if TYPE_CHECKING:  # `--help` needs this module, and should not wait for the import of numpy
     import numpy as np
     import numpy.typing as npt
 
@@ -23,7 +23,7 @@ FloatArray: TypeAlias = "npt.NDArray[np.float64]"
 
 
 class PositionSample(msgspec.Struct, frozen=True, gc=False):
-    """What a controller gets to see: where the vehicle is, and when. There is no velocity in it.
+    """A measured pose, the only measurement that a controller gets. It has no velocity.
 
     t_ns   simulation time of the sample, ns
     q      (6,) x, y, z (m, north east down), roll, pitch, yaw (rad, each within +-pi)
@@ -34,11 +34,11 @@ class PositionSample(msgspec.Struct, frozen=True, gc=False):
 
 
 class ActuatorCommand(msgspec.Struct, frozen=True, gc=False):
-    """What the motors are told.
+    """The command to the motors.
 
-    t_ns     time of the sample this command answers, ns (the echo)
-    tau      (6,) body force (N) and torque (N m) asked of the motors, before the gears
-    armed    whether the motors may act at all
+    t_ns     time of the sample that this command answers, ns (the echo)
+    tau      (6,) commanded body force (N) and torque (N m) of the motors, before the gears
+    armed    whether the motors may act
     """
 
     t_ns: int

@@ -14,12 +14,12 @@ from protocol.compiled import compiled
 PI = math.pi
 TWO_PI = 2.0 * math.pi
 PITCH_LIMIT_RAD = 1.4
-"""|beta| beyond which the plant refuses: det M_r = Ixx Iyy Izz cos(beta) goes to zero at pi/2."""
+"""Largest |pitch| (beta) of the plant: det M_r = Ixx Iyy Izz cos(beta) goes to zero at pi/2."""
 
 
 @compiled
 def wrap_angle(angle: float) -> float:
-    """The angle in [-pi, pi] that differs from `angle` (rad) by whole turns."""
+    """`angle` (rad) wrapped to [-pi, pi]."""
     if -PI <= angle <= PI:
         return angle
     return angle - TWO_PI * math.floor((angle + PI) / TWO_PI)
@@ -27,7 +27,7 @@ def wrap_angle(angle: float) -> float:
 
 @compiled
 def unwrap_angle(angle: float, last: float) -> float:
-    """`angle` (rad) moved by whole turns to within half a turn of `last`; the same bits where no turn is needed."""
+    """`angle` (rad) shifted by whole turns to within half a turn of `last`; bit-identical where no shift is needed."""
     difference = angle - last
     if -PI <= difference <= PI:
         return angle

@@ -1,7 +1,7 @@
-"""Scenarios: every number of a run, from a TOML file into frozen, typed, checked structs.
+"""Scenarios: all parameters of a run, read from a TOML file into frozen, typed, validated structs.
 
 SI units and radians throughout; names with an equation number are the paper's symbols. An unknown key, a wrong type or a
-value out of range raises `ScenarioError`, whose sentence names the file, the key and the remedy.
+value out of range raises `ScenarioError`, whose message names the file, the key and the remedy.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ NotNegative6: TypeAlias = tuple[NotNegative, NotNegative, NotNegative, NotNegati
 ZERO6: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 NANOSECONDS = due.NANOSECONDS
 LONGEST_S = 4_000_000.0
-"""The longest time in a scenario: 46 days; the wire counts milliseconds in 32 bits."""
+"""The longest time in a scenario: 46 days, since MAVLink counts milliseconds in 32 bits."""
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table of a scenario file: frozen, and closed to keys it does not know."""
+    """A table of a scenario file: frozen; unknown keys are refused."""
 
     def __post_init__(self) -> None:
         for field, value in _floats(self):
@@ -85,7 +85,7 @@ class Backlash(Table, frozen=True, tag_field="model", tag="backlash"):
         super().__post_init__()
         for axis, h, kappa in zip(AXES, self.h, self.kappa, strict=True):
             if kappa >= h:
-                raise ValueError(f"kappa must be below h, and is not on axis {axis} ({kappa} >= {h})")
+                raise ValueError(f"kappa must be below h, but is not on axis {axis} ({kappa} >= {h})")
 
 
 class Play(Table, frozen=True, tag_field="model", tag="play"):
@@ -96,14 +96,14 @@ class Play(Table, frozen=True, tag_field="model", tag="play"):
 
 
 class Disturbance(Table, frozen=True):
-    """A body force and torque after the gears, amplitude * sin(frequency * t); N, N m, rad/s."""
+    """A body force and torque at the gear output, amplitude * sin(frequency * t); N, N m, rad/s."""
 
     amplitude: Vector6
     frequency_rad_s: NotNegative
 
 
 class Actuators(Table, frozen=True):
-    """Limits in the body frame (N, N m), the scale of each channel on the wire, and what a stale command turns into."""
+    """Limits in the body frame (N, N m), the wire scale of each channel, and the safe command that replaces a stale one."""
 
     lower: Vector6
     upper: Vector6
@@ -115,22 +115,22 @@ class Actuators(Table, frozen=True):
         super().__post_init__()
         for axis, low, high, scale, safe in zip(AXES, self.lower, self.upper, self.scale, self.safe, strict=True):
             if not low <= 0.0 <= high or low == high:
-                raise ValueError(f"lower and upper must enclose zero, and do not on axis {axis} ({low}, {high})")
+                raise ValueError(f"lower and upper must enclose zero, but do not on axis {axis} ({low}, {high})")
             if scale < max(-low, high):
-                raise ValueError(f"scale must be at least the larger limit, and is not on axis {axis} ({scale})")
+                raise ValueError(f"scale must be at least the larger limit, but is not on axis {axis} ({scale})")
             if not low <= safe <= high:
-                raise ValueError(f"safe must lie within the limits, and does not on axis {axis} ({safe})")
+                raise ValueError(f"safe must lie within the limits, but does not on axis {axis} ({safe})")
 
 
 class Delay(Table, frozen=True):
-    """Delay from a sample to the action of its command: whole periods, and seconds."""
+    """Delay from a sample to the action of its command: whole periods plus seconds."""
 
     samples: Annotated[int, Meta(ge=0, le=1000)] = 0
     seconds: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
 
 
 class Noise(Table, frozen=True):
-    """Standard deviation of the position (m) and of each attitude angle (rad) as measured."""
+    """Standard deviation of the measured position (m) and of each measured attitude angle (rad)."""
 
     position: NotNegative = 0.0
     attitude: NotNegative = 0.0
@@ -149,7 +149,7 @@ class Reference(Table, frozen=True):
 
 
 class Control(Table, frozen=True):
-    """What every law believes about the vehicle.
+    """The vehicle model that all laws assume.
 
     b             input gain over mass or inertia (15), 1/kg, 1/(kg m^2)
     uhat0         estimate of u_d at the start, m/s^2, rad/s^2
@@ -162,7 +162,7 @@ class Control(Table, frozen=True):
 
 
 class World(Table, frozen=True):
-    """Where the emulator says it is: for real autopilots, never for the laws. Field in gauss, temperature in Celsius."""
+    """Place of the emulated vehicle: for real autopilots, never for the laws. Field in gauss, temperature in Celsius."""
 
     latitude_deg: Annotated[float, Meta(ge=-90.0, le=90.0)] = 47.397742
     longitude_deg: Annotated[float, Meta(ge=-180.0, le=180.0)] = 8.545594
@@ -172,29 +172,29 @@ class World(Table, frozen=True):
 
 
 class Wire(Table, frozen=True):
-    """Who the emulator is on the link: its MAVLink component id."""
+    """Identity of the emulator on the link: its MAVLink component id."""
 
     emulator_component: Annotated[int, Meta(ge=2, le=255)] = 191
 
 
 class Motor(Table, frozen=True):
-    """The drives on a CAN bus, six alike; without one (`--motor direct`) nothing of this table is used.
+    """The drives on a CAN bus, six of the same type; without a bus (`--motor direct`) this table is not used.
 
-    bitrate             of the bus, bit/s; the one that load and delay are reckoned with
+    bitrate             of the bus, bit/s; load and delay are calculated with it
     first_node_id       the drive of axis i has node id first_node_id + i
-    full_scale_nm       torque on the bus that stands for `actuators.scale` of an axis. A power of two keeps every bit.
+    full_scale_nm       torque on the bus that represents `actuators.scale` of an axis. A power of two makes this exact.
     lag_s               time constant of the drive's torque (current) loop        loop_hz  rate of that loop
     rate_limit          fastest change of an axis, in full scales per second; 0: none
     torque_limit        largest torque of an axis, as a fraction of full scale
-    watchdog_s          without a command for this long the drive turns to `actuators.safe` and latches an error
-    temperature_rise    steady rise at full torque (K), reached with thermal_time_constant_s; copper loss goes with torque^2
-    over_temperature_celsius    above it the drive turns to `actuators.safe` and latches an error
+    watchdog_s          without a command for this long the drive changes to `actuators.safe` and latches an error
+    temperature_rise    steady rise at full torque (K), with time constant thermal_time_constant_s; proportional to torque^2
+    over_temperature_celsius    above it the drive changes to `actuators.safe` and latches an error
     torque_constant     N m per A of motor current        bus_voltage  of the supply, V
-    travel_rad          shaft angle that stands for `actuators.scale`: motor side for tau, output side for u
-    encoder_counts      per turn, both sides              velocity_resolution  rad/s; 0: none
+    travel_rad          shaft angle that represents `actuators.scale`: motor side for tau, output side for u
+    encoder_counts      per turn, both sides              velocity_resolution  rad/s; 0: exact
     *_rate_hz           cyclic messages: encoder, heartbeat, and the rest of the status
-    bus_delay           commands act later by the worst wait for the bus and their own time on it
-    mit_*               ranges of the MIT frames (each +-) and the length of a reply: they differ by motor
+    bus_delay           commands act later by their worst waiting and transmission time on the bus
+    mit_*               ranges of the MIT frames (each +-) and length of a reply, which depend on the motor
     """
 
     protocol: str = "odrive"
@@ -233,10 +233,10 @@ AnyTable = TypeVar("AnyTable", bound=Table)
 
 
 class Scenario(Table, frozen=True):
-    """A whole run. Times in s, rates in Hz; a period is kept in whole nanoseconds (`period_ns`).
+    """A complete run. Times in s, rates in Hz; the period is a whole number of nanoseconds (`period_ns`).
 
-    gains: tables by name, as the file has them. Each law declares its own as a struct; `read_gains` checks them by it, when
-    a law is used and not before, because an emulator has no use for laws.
+    gains: tables by name, as in the file. Each law declares its own table as a struct, with which `read_gains` validates it
+    when the law is used and not before, because an emulator does not use laws.
     """
 
     name: Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9_\-]*$")]
@@ -269,25 +269,25 @@ class Scenario(Table, frozen=True):
             )
         if self.period_ns % 1000 or abs(self.period_ns * self.rate_hz / NANOSECONDS - 1.0) > 1e-9:
             raise ValueError(
-                f"rate_hz {self.rate_hz:g} has a period of {1e6 / self.rate_hz:.3f} us, which is no whole number of "
-                "microseconds (the echo on the wire counts those): choose a rate such as 100, 200, 250, 400, 500 or 1000"
+                f"rate_hz {self.rate_hz:g} has a period of {1e6 / self.rate_hz:.3f} us, which is not a whole number of "
+                "microseconds (time stamps on the link count those): choose a rate such as 100, 200, 250, 400, 500 or 1000"
             )
         if self.period_ns % self.substep_ns or abs(self.substep_ns / (self.substep_s * NANOSECONDS) - 1.0) > 1e-6:
             raise ValueError(
-                f"substep_s {self.substep_s:g} does not fit a whole number of times into the period of "
-                f"{self.period_ns / NANOSECONDS:g} s: choose substep_s = period / n"
+                f"substep_s {self.substep_s:g} does not divide the period of "
+                f"{self.period_ns / NANOSECONDS:g} s into whole steps: choose substep_s = period / n"
             )
         if self.ticks < 1:
             raise ValueError(f"duration_s {self.duration_s:g} is shorter than one period: make it longer")
         if abs(self.initial.attitude[1]) > 1.4:
             raise ValueError(
-                "initial.attitude has a pitch beyond 1.4 rad, where the equations end: choose a smaller one"
+                "initial.attitude has a pitch beyond 1.4 rad, the limit of the equations: choose a smaller one"
             )
         for axis, low, high, command in zip(
             AXES, self.actuators.lower, self.actuators.upper, self.initial.command, strict=True
         ):
             if not low <= command <= high:
-                raise ValueError(f"initial.command must lie within the actuator limits, and does not on axis {axis}")
+                raise ValueError(f"initial.command must lie within the actuator limits, but does not on axis {axis}")
 
     @property
     def period_ns(self) -> int:
@@ -296,7 +296,7 @@ class Scenario(Table, frozen=True):
 
     @property
     def substep_ns(self) -> int:
-        """Step of the integrator, ns."""
+        """Integration step, ns."""
         return max(1, round(self.substep_s * NANOSECONDS))
 
     @property
@@ -313,28 +313,28 @@ class Scenario(Table, frozen=True):
     def initial_motion(self) -> FloatArray:
         """(12,) position, attitude, velocity, attitude rate at t = 0."""
         start = self.initial
-        import numpy as np  # here: see `protocol.messages`
+        import numpy as np  # imported here: see `protocol.messages`
 
         return np.array((*start.position, *start.attitude, *start.velocity, *start.attitude_rate))
 
     def read_gains(self, table: str, declared: type[AnyTable], source: object = None) -> AnyTable:
-        """The table [gains.TABLE] as the struct in which a law declares it; `source` names the file in errors.
+        """The table [gains.TABLE] as the struct that a law declares for it; `source` names the file in error messages.
 
         Raises ScenarioError.
         """
         return _convert(self.gains.get(table, {}), declared, str(source or f"scenario {self.name}"), f"gains.{table}")
 
     def digest(self) -> bytes:
-        """8 bytes that emulator and controller must share: of all but what a command line may choose for one end alone.
+        """8 bytes that must agree between emulator and controller: of all keys except those that one end may override.
 
-        Every table of gains in the file counts, whichever law flies: the emulator's run folder keeps the file as what was
-        flown. A gain that the file leaves at its default does not count, nor do the drives, which are none of the
-        controller's business.
+        All tables of gains in the file count, whichever law flies, since the emulator's run folder stores the file as the
+        scenario flown. A gain that is not in the file (default) does not count, nor does [motor], which the controller does
+        not use.
         """
         return self._digest(without_motor=True)
 
     def drive_digest(self) -> bytes:
-        """8 bytes that emulator and drives must share: those of `digest`, and the table of the drives."""
+        """8 bytes that must agree between emulator and drives: of the keys of `digest`, and of [motor]."""
         return self._digest(without_motor=False)
 
     def _digest(self, *, without_motor: bool) -> bytes:
@@ -346,35 +346,35 @@ class Scenario(Table, frozen=True):
         return hashlib.sha256(msgspec.json.encode(document, order="sorted")).digest()[:8]
 
     def to_toml(self) -> str:
-        """The scenario in full, every default written out."""
+        """The complete scenario as TOML, including defaults."""
         return tomli_w.dumps(msgspec.to_builtins(self))
 
 
 def with_overrides(scenario: Scenario, **changes: Any) -> Scenario:
-    """A copy with top-level keys replaced; None leaves a key as it is. Raises `ScenarioError`."""
+    """A copy with top-level keys replaced; None leaves a key unchanged. Raises `ScenarioError`."""
     chosen = {key: value for key, value in changes.items() if value is not None}
     document = msgspec.to_builtins(scenario) | chosen
     return _convert(document, Scenario, "the command line")
 
 
 def replace_gains(scenario: Scenario, table: str, **gains: Any) -> Scenario:
-    """A copy with these gains of [gains.TABLE]; they are checked where a law reads them."""
+    """A copy with these gains of [gains.TABLE]; they are validated when a law reads them."""
     as_in_a_file = {name: list(gain) if isinstance(gain, tuple) else gain for name, gain in gains.items()}
     changed = {**scenario.gains.get(table, {}), **as_in_a_file}
     return msgspec.structs.replace(scenario, gains={**scenario.gains, table: changed})
 
 
 def scenario_folder() -> Path:
-    """Where the scenarios that come with the project are: beside the packages in a checkout, within one when installed."""
+    """Folder of the project's own scenarios: beside the packages in a checkout, within a package when installed."""
     root = Path(__file__).resolve().parent.parent
     beside = root / "scenarios"
     return beside if (beside / "flapper.toml").exists() else root / "fwav_hil" / "scenarios"
 
 
 def find_scenario(name: str) -> Path:
-    """The file of a path, or of the name of a scenario that comes with the project. Raises ScenarioError."""
+    """The scenario file for a path, or for the name of one of the project's own scenarios. Raises ScenarioError."""
     path = Path(name)
-    with contextlib.suppress(OSError):  # a name too long for the system, a folder that may not be searched
+    with contextlib.suppress(OSError):  # a name too long for the system, or a folder without search permission
         if path.exists():
             return path
     known = {file.stem: file for file in sorted(scenario_folder().glob("*.toml"))}
@@ -384,20 +384,20 @@ def find_scenario(name: str) -> Path:
 
 
 def load_scenario(path: Path) -> Scenario:
-    """Read and check a scenario file. Raises `ScenarioError`.
+    """Read and validate a scenario file. Raises `ScenarioError`.
 
-    A file may begin with `extends = "other.toml"`, a file beside it: it then holds only what differs from that one.
+    A file may begin with `extends = "other.toml"`, a file in the same folder: it then contains only the differences to it.
     """
     return _convert(_read_document(path, ()), Scenario, str(path))
 
 
 def parse_scenario(text: str, source: str) -> Scenario:
-    """Read and check the text of a whole scenario; `source` names it in errors. Raises `ScenarioError`."""
+    """Read and validate the text of a whole scenario; `source` names it in error messages. Raises `ScenarioError`."""
     return _convert(_parse_document(text, source), Scenario, source)
 
 
 def _read_document(path: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
-    """The tables of a file, upon those of the file it extends; `extending` holds the files on the way here."""
+    """The tables of a file merged into those of the file that it extends; `extending` lists the files read so far."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -408,12 +408,12 @@ def _read_document(path: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
     if base is None:
         return document
     if not isinstance(base, str) or path.resolve() in extending:
-        raise ScenarioError(f"{path}, extends: name one other scenario file, and no circle of them")
+        raise ScenarioError(f"{path}, extends: name one other scenario file, without a circle of extends")
     return _merge(_read_document(path.parent / base, (*extending, path.resolve())), document)
 
 
 _ONCE_IN_CONTROL = {"ude": ("K", "Lambda"), "filters": ("T", "N", "order"), "pd": ("Kp", "Kd")}
-"""The gains that stood in [control] before laws had tables of their own: scenarios in run folders of then are still read."""
+"""Gains that were in [control] in earlier versions: scenarios in old run folders can still be read."""
 
 
 def _parse_document(text: str, source: str) -> dict[str, Any]:
@@ -430,7 +430,7 @@ def _parse_document(text: str, source: str) -> dict[str, Any]:
 
 
 def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """`base` with the keys of `changes` put in; tables are merged key by key, but a table of another model as a whole."""
+    """`base` updated with `changes`; tables are merged key by key, but a table of another model is replaced as a whole."""
     merged = dict(base)
     for key, value in changes.items():
         old = merged.get(key)
@@ -441,7 +441,7 @@ def _merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def _convert(document: Any, kind: type[AnyTable], source: str, within: str = "") -> AnyTable:
-    """A document, or a table of one (`within`: its dotted key), as its struct. Raises ScenarioError."""
+    """A document, or one of its tables (`within`: the dotted key), as its struct. Raises ScenarioError."""
     try:
         return msgspec.convert(document, kind)
     except msgspec.ValidationError as error:
@@ -449,7 +449,7 @@ def _convert(document: Any, kind: type[AnyTable], source: str, within: str = "")
 
 
 def _sentence(message: str, source: str, within: str, kind: type[Table], document: Any) -> str:
-    """Turn the library's message into a sentence that names the file, the key and the remedy."""
+    """Convert the library's message into one that names the file, the key and the remedy."""
     reason, _, path = message.partition(" - at `")
     key = path.removesuffix("`").removeprefix("$").removeprefix(".")
     place = ".".join(part for part in (within, key) if part)
@@ -462,7 +462,7 @@ def _sentence(message: str, source: str, within: str, kind: type[Table], documen
 
 
 def unknown_key(source: object, place: str, key: str, known: list[str]) -> str:
-    """The sentence on a key that is not known in the table `place`, with what was meant or may stand there."""
+    """Error message for an unknown key in the table `place`, with the most similar key or all known ones."""
     near = difflib.get_close_matches(key, known, n=1)
     remedy = f"did you mean '{near[0]}'?" if near else f"known here: {', '.join(known)}"
     return f"{source}: unknown key '{f'{place}.' if place else ''}{key}': {remedy}"

@@ -133,7 +133,7 @@ def layouts_by_name() -> Mapping[str, Layout]:
 
 
 def unit(message: str, field: str) -> str:
-    """The unit of a field as the dialect writes it ("m/s"); empty where it has none, or is no message of the dialect."""
+    """The unit of a field as in the dialect ("m/s"); empty without a unit, or for a message not in the dialect."""
     known = layouts_by_name().get(message)
     units = _messages()[known.message_id].fieldunits_by_name if known else {}
     return str(units.get(field, ""))

@@ -1,7 +1,7 @@
-"""Frames changed on their way: their time fields moved, their checksums made to fit.
+"""Shifting of the time fields of frames, with new checksums.
 
-What changes: time_usec, time_boot_ms, time_boot_us and time_unix_usec of the dialect's messages. Times since 1970 then begin
-at the present; times since boot begin at zero for each system, as if it had booted now. Zero means unknown, and stays.
+Changed fields: time_usec, time_boot_ms, time_boot_us and time_unix_usec of the dialect's messages. Times since 1970 then
+begin now; times since boot begin at zero for each system, as if it had booted now. Zero means unknown, and is kept.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from protocol.wire.codec import Layout
 from protocol.wire.framing import CRC_SIZE, HEADER_V1, HEADER_V2, MAGIC_V1, SIGNED, checksum, message_of
 
 TIME_FIELDS = MappingProxyType({"time_usec": 1, "time_boot_us": 1, "time_unix_usec": 1, "time_boot_ms": 1000})
-"""Names of the fields that are moved, and their unit in us."""
+"""Names of the fields that are shifted, and their unit in us."""
 UNIX_FROM_US = 10**15
-"""A time from here on is one since 1970 (this is September 2001); any other is one since boot (this is 31 years)."""
+"""Times from here on count from 1970 (this is September 2001); smaller ones count from boot (this is 31 years)."""
 
 
 def time_fields(message: Layout) -> tuple[tuple[int, int, int], ...]:
@@ -34,13 +34,13 @@ def time_fields(message: Layout) -> tuple[tuple[int, int, int], ...]:
 
 
 class TimeMover:
-    """Moves the time fields of a log's frames so that they begin now, at now_us since 1970.
+    """Shifts the time fields of a log's frames so that they begin now, at now_us since 1970.
 
-    moved   how many frames were changed
+    moved   number of changed frames
     """
 
     def __init__(self, scan: Scan, chosen: npt.NDArray[np.bool_], now_us: int) -> None:
-        """See which times the chosen frames (a truth value for each row of the scan) begin with."""
+        """Find the first times of the chosen frames (a boolean for each row of the scan)."""
         self.moved = 0
         self._fields = {number: time_fields(message) for number, message in layouts().items()}
         firsts: dict[int, int] = {}
@@ -62,7 +62,7 @@ class TimeMover:
         self._unix_shift_us = now_us - unix_us if unix_us else 0
 
     def move(self, frame: bytes, extra_us: int) -> bytes:
-        """The frame with its times moved, and by extra_us more; a signature, which no longer fits, is left out."""
+        """The frame with its times shifted, and by extra_us more; its signature, no longer valid, is removed."""
         number = message_of(frame, 0)
         system, header = (frame[3], HEADER_V1) if frame[0] == MAGIC_V1 else (frame[5], HEADER_V2)
         fields = self._fields.get(number, ())
@@ -84,7 +84,7 @@ class TimeMover:
 
 
 def _sealed(frame: bytes, header: int, payload: bytearray, message: Layout) -> bytes:
-    """The frame with another payload; MAVLink 1 keeps its length, MAVLink 2 has trailing zeros cut off, and no signature."""
+    """The frame with a new payload: MAVLink 1 of the same length, MAVLink 2 without trailing zeros and signature."""
     if header == HEADER_V1:
         body = frame[1:header] + payload[: frame[1]]
     else:

@@ -1,4 +1,4 @@
-"""What is done with the rows that the scanner found, in compiled code: stamps mended, frames counted and copied into tables."""
+"""Compiled processing of the rows that the scanner found: repair stamps, count frames and copy them into tables."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _LOOK_AHEAD = 8
 
 @compiled
 def mend_stamps(frames: npt.NDArray[np.void]) -> int:
-    """Replace stamps that damage has made absurd by the one before (the next, at the start); returns how many.
+    """Replace damaged stamps by the previous one (at the start: by the next one); returns how many.
 
-    A stamp that is a minute or more away from the one before is damaged where one of the next few is not; where they all
-    are, the clock was set or the recording paused, and it stands. One without a date is damaged anyhow.
+    A stamp more than a minute from the previous one is damaged if one of the next few is not that far away; if all are, the
+    clock was set or the recording paused, and it is kept. A stamp that is not a valid date is always damaged.
     """
     count = frames.shape[0]
     mended = 0
@@ -61,7 +61,7 @@ def mend_stamps(frames: npt.NDArray[np.void]) -> int:
 def count_rows(frames: npt.NDArray[np.void], chosen: npt.NDArray[np.uint8], slots: Table, counts: State) -> None:
     """Count the frames of each slot (`slots` gives slot + 1 of a message id, or 0) into `counts`.
 
-    Left out are frames not chosen, unknown ones and those with flags of unknown meaning; an empty `chosen` is all.
+    Unchosen and unknown frames, and those with flags of unknown meaning, are not counted; an empty `chosen` selects all.
     """
     for i in range(frames.shape[0]):
         frame = frames[i]
@@ -82,10 +82,10 @@ def fill_rows(
     head: int,
     rows: Output,
 ) -> None:
-    """Copy each frame that `count_rows` counts into the row at `places` of its slot, which then moves on.
+    """Copy each frame that `count_rows` counts into the row at `places` of its slot, and advance that place.
 
     A row is a head of `head` bytes (stamp, system, component, sequence) and the payload, `sizes` bytes long; `rows` must
-    be zero at first, since a payload may lack trailing zeros. What a newer definition has more is left out.
+    be zero at first, since a payload may lack trailing zeros. Extra fields of a newer definition are not copied.
     """
     for i in range(frames.shape[0]):
         frame = frames[i]

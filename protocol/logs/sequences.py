@@ -1,4 +1,4 @@
-"""Frames that are missing from a log, by the sequence numbers of those that are there."""
+"""Frames missing from a log, found from the sequence numbers of the others."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from protocol.wire.framing import HALF_SEQUENCE
 
 @compiled
 def follow(frames: npt.NDArray[np.void], counts: npt.NDArray[np.int64]) -> None:
-    """Follow the numbers of each sender; row `system << 8 | component` of counts: frames, lost, out of order, next number.
+    """Check the numbers of each sender; row `system << 8 | component` of counts: frames, lost, out of order, next number.
 
-    The rule is that of `codec.FrameReader`: a number up to 127 ahead of the next one means so many lost frames, any
-    other a frame that came again or late.
+    The same rule as in `codec.FrameReader`: a number up to 127 ahead of the expected one means that so many frames were
+    lost, any other one that the frame is repeated or late.
     """
     for i in range(frames.shape[0]):
         frame = frames[i]
@@ -31,7 +31,7 @@ def follow(frames: npt.NDArray[np.void], counts: npt.NDArray[np.int64]) -> None:
 
 
 def count_losses(scan: Scan) -> dict[tuple[int, int], tuple[int, int]]:
-    """(lost, out of order) by (system, component) of all who sent something."""
+    """(lost, out of order) by (system, component) of all senders."""
     counts = np.zeros((1 << 16, 4), dtype=np.int64)
     follow(scan.frames, counts)
     return {

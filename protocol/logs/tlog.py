@@ -19,7 +19,7 @@ _SIGNED = 0x01
 
 
 class TlogWriter(AppendFile):
-    """Writes frames, gathered into large writes. Raises `RunFolderError` where the file cannot be written."""
+    """Writes frames in large blocks. Raises `RunFolderError` where the file cannot be written."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "the log")
@@ -36,22 +36,21 @@ class TlogWriter(AppendFile):
         self._pending += frame
 
     def hand_over(self) -> None:
-        """Let go of what was written so far, where somebody else writes it to disk; here it waits for `flush`."""
+        """Pass the frames so far to a separate writer, where there is one; here they wait for `flush`."""
 
     def flush(self) -> None:
-        """Hand what is pending to the system."""
+        """Write pending data to the system."""
         try:
-            while self._pending:  # a nearly full disk takes a part, and tells why only when asked again
+            while self._pending:  # a nearly full disk takes a part, and reports the error only at the next write
                 del self._pending[: self._file.write(self._pending)]
         except OSError as error:
             raise self._refused(error) from None
 
 
 def read_tlog(path: Path) -> Iterator[tuple[int, Frame]]:
-    """(time in us, frame) of each record, in order; stops at a record that is cut short or damaged.
+    """(time in us, frame) of each record, in order; stops at a truncated or damaged record.
 
-    The strict reading, for logs of this project; `log_scan.scan_tlog` goes on behind damage. Raises LogError where the
-    file cannot be read.
+    For logs of this project; `scan.scan_tlog` continues after damage. Raises LogError where the file cannot be read.
     """
     scan = scan_tlog(path)
     at = 0

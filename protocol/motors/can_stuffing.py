@@ -1,4 +1,4 @@
-"""The bits that one frame takes on the wire, its own stuffing counted: see `can_frame` for the layout."""
+"""Exact number of bits of one frame on the wire, with stuffing: see `can_frame` for the layout."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _RUN = 5
 
 
 def exact_bits(frame: CanFrame) -> int:
-    """Bits that just this frame takes, stuffing counted, the gap to the next frame included."""
+    """Bits of this frame, including stuffing and the gap to the next frame."""
     data = frame.data.ljust(LONGEST_DATA, b"\0")
     high, low = int.from_bytes(data[:4], "big"), int.from_bytes(data[4:], "big")
     return int(_bits_on_the_wire(frame.can_id, frame.extended, frame.remote, len(frame.data), high, low))
@@ -19,7 +19,7 @@ def exact_bits(frame: CanFrame) -> int:
 
 @compiled
 def _bits_on_the_wire(can_id: int, extended: bool, remote: bool, length: int, high: int, low: int) -> int:
-    """`exact_bits`; the data as two halves of 32 bits, the first byte highest. Checksum and stuffing go bit by bit."""
+    """`exact_bits` with the data as two 32-bit halves, first byte highest. Checksum and stuffing are computed bit by bit."""
     header = 39 if extended else 19
     total = header + 8 * length + 15
     crc = 0

@@ -1,4 +1,4 @@
-"""DroneCAN: six ESCs that PX4, ArduPilot and the DroneCAN GUI see as such. The frames are made by the `dronecan` library.
+"""DroneCAN: six ESCs that PX4, ArduPilot and the DroneCAN GUI recognise. The `dronecan` library makes the frames.
 
 Source: DroneCAN specification, "CAN bus transport layer" (dronecan.github.io/Specification/4._CAN_bus_transport_layer)
 and the standard data types 1030 uavcan.equipment.esc.RawCommand, 1034 uavcan.equipment.esc.Status, 341
@@ -7,11 +7,11 @@ uavcan.protocol.NodeStatus, service 1 uavcan.protocol.GetNodeInfo.
     identifier   29 bits: priority 5, type 16, 0, source 7; of a service: priority 5, type 8, request 1, to 7, 1, from 7
     RawCommand   14 bits signed for each ESC, 8191 is full scale; six of them take two frames
     Status       error count, V, A, K, rev/min, per cent, index; three frames, at status_rate_hz of each drive
-    NodeStatus   once a second from each drive and from the host; uptime that goes back is a restart
+    NodeStatus   once per second from each drive and from the host; a decreasing uptime means a restart
 
 ESC i is node first_node_id + i. DroneCAN has no message that enables an ESC or clears its errors: here, as with many ESCs,
-a command of zero does both, and none but zero does, so a drive never starts or comes back with torque on it (chosen).
-RawCommand is no torque by name; it is full scale by 8191 here.
+only a zero command does both, so a drive never starts or recovers with torque on it (our choice).
+RawCommand is not defined as a torque; here 8191 is full-scale torque.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def _frames(transfer: Any) -> list[CanFrame]:
 
 
 class _Receiver:
-    """Gathers the frames of transfers; a transfer that is complete comes out, one that is amiss is a cause."""
+    """Assembles frames to transfers; returns a complete transfer, or a Cause for a bad one."""
 
     def __init__(self) -> None:
         self._manager = transport.TransferManager()
@@ -98,7 +98,7 @@ class _Receiver:
         transfer = transport.Transfer()
         try:
             transfer.from_frames(frames)
-        except (transport.TransferError, ValueError, IndexError):  # the library unpacks whatever bits there are
+        except (transport.TransferError, ValueError, IndexError):  # the library unpacks any bits
             return Cause.MALFORMED
         return transfer
 
@@ -188,7 +188,7 @@ class Drive(motor_protocol.Drive):
             return Cause.FOREIGN
         if frame.can_id >> 16 & 0xFF != GET_NODE_INFO:
             return Cause.UNKNOWN
-        # A request without content is a frame of just the tail byte, which the library's Transfer takes.
+        # A request without content is a frame with only the tail byte, which the library's Transfer accepts.
         transfer = self._receiver.decode(frame)
         if transfer is None or isinstance(transfer, Cause):
             return transfer or ()
@@ -238,7 +238,7 @@ def _node_status(t_ns: int, faults: int) -> Any:
 
 
 def traffic(motor: Motor, rate_hz: float) -> list[Traffic]:
-    """RawCommand at rate_hz in two frames, Status of six in three, NodeStatus of six and of the host."""
+    """RawCommand at rate_hz in two frames, Status of each drive in three, NodeStatus of each drive and of the host."""
     raw = HIGH << 24 | RAW_COMMAND << 8 | HOST_NODE
     status = MEDIUM << 24 | ESC_STATUS << 8 | motor.first_node_id
     node = LOW << 24 | NODE_STATUS << 8 | motor.first_node_id

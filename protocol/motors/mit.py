@@ -1,4 +1,4 @@
-"""MIT mini-cheetah protocol, as T-Motor AK drives speak it ("MIT power mode").
+"""MIT mini-cheetah protocol, as used by T-Motor AK drives ("MIT power mode").
 
 Source: B. Katz, "A low cost modular actuator for dynamic robots" (MIT, 2018) and its firmware's CAN description; CubeMars
 "AK Series Actuator Driver Manual" V1.0.8, section 5.3. Layout in mit.dbc, for drive 1, raw numbers.
@@ -7,13 +7,13 @@ Source: B. Katz, "A low cost modular actuator for dynamic robots" (MIT, 2018) an
     enter     FF FF FF FF FF FF FF FC      exit  ... FD      set zero  ... FE
     reply     identifier: MASTER  byte 0 drive, position 16, velocity 12, torque 12 [, temperature 8 [, error 8]]
 
-Each number is an unsigned fraction of its range: raw = round((x + range) / (2 range) (2^bits - 1)). Zero torque is no whole
-raw number (2047.5): a drive that gets 2048 sees 1.2e-4 of its range. Ranges and the length of a reply (5 bytes: no drive
-byte; 6; 8: temperature and error) differ by motor, so they are parameters. Every command, enter, exit and zero frame is
-answered by one reply. Only torques are commanded here: position, velocity and both gains are 0.
+Each number is an unsigned fraction of its range: raw = round((x + range) / (2 range) (2^bits - 1)). Zero torque lies between
+two raw numbers (2047.5): a drive that gets 2048 sees 1.2e-4 of its range. Ranges and the length of a reply (5 bytes: no drive
+byte; 6; 8: temperature and error) depend on the motor, so they are parameters. Every command, enter, exit and zero frame gets
+one reply. Only torques are commanded here: position, velocity and both gains are 0.
 
-The drive's temperature is sent in whole degrees with an offset of 40 (AK manual); error codes 0 none, 1 over temperature,
-and 8 for a lost command, which the manual does not list.
+The drive's temperature is sent in whole degrees with an offset of 40 (AK manual); error codes: 0 none, 1 over temperature,
+8 lost command (not in the manual).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _FULL16, _FULL12 = 0xFFFF, 0xFFF
 
 
 def to_raw(value: float, low: float, high: float, full: int) -> int:
-    """The raw number nearest to a value, held at the ends of its range."""
+    """The raw number nearest to a value, saturated at its range."""
     return round((min(max(value, low), high) - low) / (high - low) * full)
 
 
@@ -53,7 +53,7 @@ def from_raw(raw: int, low: float, high: float, full: int) -> float:
 
 
 def pack_command(position: int, velocity: int, kp: int, kd: int, torque: int) -> bytes:
-    """The 8 bytes of a command from raw numbers."""
+    """The 8 bytes of a command, from raw numbers."""
     return (position << 48 | velocity << 36 | kp << 24 | kd << 12 | torque).to_bytes(8, "big")
 
 
@@ -64,7 +64,7 @@ def unpack_command(data: bytes) -> tuple[int, int, int, int, int]:
 
 
 class Host(motor_protocol.Host):
-    """The commanding end. A reply of 5 bytes does not say whose it is: replies are then taken in the order of commands."""
+    """The commanding end. A 5-byte reply does not name its drive: replies are then assigned in the order of the commands."""
 
     def __init__(self, motor: Motor) -> None:
         super().__init__(motor)
@@ -75,8 +75,8 @@ class Host(motor_protocol.Host):
         self._next = 0
 
     def enable(self, axes: Sequence[int] = AXIS_NUMBERS) -> list[CanFrame]:
-        # EXIT clears errors and lets go: a drive that flies must not get it. Replies in the order of commands, though,
-        # are told apart by their number alone.
+        # EXIT clears errors and disables: an enabled drive must not get it. But 5-byte replies are told apart only by
+        # their order, so then all drives get it.
         chosen = AXIS_NUMBERS if self.motor.mit_reply_bytes == 5 else axes
         return [CanFrame(self._ids[axis], data) for data in (EXIT, ENTER) for axis in chosen]
 
@@ -122,14 +122,14 @@ class Host(motor_protocol.Host):
 
 
 class Drive(motor_protocol.Drive):
-    """Six drives. Nothing is cyclic: each frame to a drive has one reply."""
+    """Six drives, without cyclic messages: each frame to a drive gets one reply."""
 
     def __init__(self, motor: Motor) -> None:
         super().__init__(motor)
         _check_range(motor)
 
     def restart(self) -> None:
-        """There is no schedule."""
+        """Do nothing: there are no cyclic messages."""
 
     def decode(self, frame: CanFrame) -> Sequence[Order] | Cause:
         axis, data, motor = frame.can_id - self.motor.first_node_id, frame.data, self.motor
@@ -147,7 +147,7 @@ class Drive(motor_protocol.Drive):
             return (Order(Action.NOTHING, axis),)
         *_, kp, kd, torque = unpack_command(data)
         if kp or kd:
-            return Cause.UNKNOWN  # a position or velocity loop: this drive has none
+            return Cause.UNKNOWN  # this drive has no position or velocity loop
         limit = motor.mit_torque_range
         return (Order(Action.TORQUE, axis, from_raw(torque, -limit, limit, _FULL12) / motor.full_scale_nm),)
 
@@ -182,12 +182,12 @@ def _check_range(motor: Motor) -> None:
     if motor.full_scale_nm > motor.mit_torque_range:
         raise ScenarioError(
             f"motor.full_scale_nm {motor.full_scale_nm:g} is beyond motor.mit_torque_range {motor.mit_torque_range:g}: "
-            "the frames could not carry full scale; lower the one or raise the other"
+            "the frames could not carry full scale; lower full_scale_nm or raise mit_torque_range"
         )
 
 
 def traffic(motor: Motor, rate_hz: float) -> list[Traffic]:
-    """A command and a reply for each axis at rate_hz."""
+    """One command and one reply per axis, at rate_hz."""
     return [
         Traffic("reply", MASTER, motor.mit_reply_bytes, rate_hz, step=0),
         Traffic("command", motor.first_node_id, 8, rate_hz, command=True),

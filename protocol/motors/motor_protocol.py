@@ -1,10 +1,10 @@
-"""What every CAN motor protocol does: torque commands for six axes into frames, frames into orders and readings.
+"""Interface of the CAN motor protocols: torque commands for six axes to frames, and frames to orders and readings.
 
 A protocol is one file with a `Host` (the commanding end), a `Drive` (the six drives) and a `traffic` list, and one line in
-PROTOCOLS. Neither end does any I/O or asks for the time. Torques are fractions of full scale here (1 is `actuators.scale`
-of the axis), angles rad at the shaft; what a protocol makes of them stands in its file.
+PROTOCOLS. Neither end does I/O or reads the time. Torques are fractions of full scale here (1 is `actuators.scale`
+of the axis), angles in rad at the shaft; each protocol's file describes its own units.
 
-A frame that cannot be taken is no exception but a cause, one of CAUSES, for the caller to count.
+A rejected frame does not raise an exception: it gives a cause, one of CAUSES, which the caller counts.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ AXIS_NUMBERS: Final = tuple(range(DRIVES))
 
 
 class Cause(enum.Enum):
-    """Why a frame was not taken: `counters` are named after these."""
+    """Why a frame was rejected; the counters have these names."""
 
     FOREIGN = "foreign_frames"
-    """of somebody else on the bus: another protocol, another node"""
+    """from or to another node, or of another protocol"""
     UNKNOWN = "unknown_frames"
-    """to or from one of our drives, but of no message known here"""
+    """to or from one of our drives, but of an unknown message"""
     SHORT = "short_frames"
     """too few bytes for its message"""
     MALFORMED = "malformed_frames"
-    """a value that cannot be: not a number, a wrong checksum, a toggle out of turn"""
+    """an invalid value: not a number, a wrong checksum, a wrong toggle bit"""
 
 
 CAUSES: Final = tuple(cause.value for cause in Cause)
 
 
 class Action(enum.Enum):
-    """What a frame asks of a drive."""
+    """Request to a drive in a frame."""
 
     TORQUE = enum.auto()
     ENABLE = enum.auto()
@@ -50,13 +50,13 @@ class Action(enum.Enum):
     CLEAR = enum.auto()
     ESTOP = enum.auto()
     ASK = enum.auto()
-    """a reading; `Order.detail` says which, in the protocol's own terms"""
+    """request for a reading; `Order.detail` says which one, in the protocol's own terms"""
     NOTHING = enum.auto()
-    """a message that was understood and changes nothing here"""
+    """a known message without effect here"""
 
 
 class Order(NamedTuple):
-    """One order to one drive. torque: fraction of full scale, for TORQUE only. detail: the protocol's own."""
+    """One order to one drive. torque: fraction of full scale, for TORQUE only. detail: defined by the protocol."""
 
     action: Action
     axis: int
@@ -65,7 +65,7 @@ class Order(NamedTuple):
 
 
 class Fault(enum.IntFlag):
-    """Why a drive gives its safe output; latched until cleared."""
+    """Why a drive is at its safe output; latched until cleared."""
 
     WATCHDOG = 1
     OVER_TEMPERATURE = 2
@@ -73,7 +73,7 @@ class Fault(enum.IntFlag):
 
 
 class Reading(NamedTuple):
-    """A drive as it shows itself.
+    """Present state of a drive, as it reports it.
 
     position, velocity    output shaft, after the gear (rad, rad/s)      motor_position   motor shaft, before it (rad)
     target, torque        commanded and present motor torque, fractions of full scale
@@ -92,7 +92,7 @@ class Reading(NamedTuple):
 
 
 class Status(NamedTuple):
-    """What a host learns of one drive from one frame; None: the frame does not say."""
+    """What one frame tells a host about one drive; None: not contained in the frame."""
 
     axis: int
     position: float | None = None
@@ -104,9 +104,9 @@ class Status(NamedTuple):
 
 
 class Traffic(NamedTuple):
-    """Frames of one kind on the bus: how many, of how many bytes, how often.
+    """Frames of one kind on the bus: number, length in bytes, rate.
 
-    can_id   of the first; each further one has an identifier higher by `step`. Identifiers decide who waits for whom.
+    can_id   of the first; each further one has an identifier higher by `step`. Lower identifiers have priority.
     command  whether these frames carry the torques
     """
 
@@ -133,26 +133,26 @@ class Host(abc.ABC):
 
     @abc.abstractmethod
     def enable(self, axes: Sequence[int] = AXIS_NUMBERS) -> list[CanFrame]:
-        """The frames that clear errors and make the drives of these axes follow torque commands.
+        """The frames that clear errors and enable the drives of these axes.
 
-        Where a protocol cannot tell them apart they go to all, which must then not disturb a drive that follows already.
+        Where a protocol cannot address single drives they go to all, and must not disturb a drive that is already enabled.
         """
 
     @abc.abstractmethod
     def disable(self) -> list[CanFrame]:
-        """The frames that make all drives let go."""
+        """The frames that disable all drives."""
 
     @abc.abstractmethod
     def command(self, torque: FloatArray) -> list[CanFrame]:
         """The frames that carry torque (6,), fractions of full scale."""
 
     def cyclic(self, t_ns: int) -> list[CanFrame]:
-        """What a host says at t_ns whatever it commands; most protocols have no such thing."""
+        """Cyclic frames of the host due at t_ns, independent of commands; most protocols have none."""
         return []
 
     @abc.abstractmethod
     def decode(self, frame: CanFrame) -> Sequence[Status] | Cause:
-        """What a frame from the bus says of the drives, or why it was not taken."""
+        """The states of drives in a frame from the bus, or why it was rejected."""
 
 
 class Drive(abc.ABC):
@@ -163,11 +163,11 @@ class Drive(abc.ABC):
 
     @abc.abstractmethod
     def decode(self, frame: CanFrame) -> Sequence[Order] | Cause:
-        """The orders in a frame from the bus, or why it was not taken."""
+        """The orders in a frame from the bus, or why it was rejected."""
 
     @abc.abstractmethod
     def reply(self, order: Order, reading: Reading) -> Sequence[CanFrame]:
-        """What the drive of that order says to it, if the protocol has it answer."""
+        """The drive's reply to an order, in protocols that have replies."""
 
     @abc.abstractmethod
     def cyclic(self, t_ns: int, readings: Sequence[Reading]) -> list[CanFrame]:
@@ -175,7 +175,7 @@ class Drive(abc.ABC):
 
     @abc.abstractmethod
     def restart(self) -> None:
-        """Begin the schedule of the cyclic messages anew: the time that `cyclic` is asked with has changed."""
+        """Restart the schedule of the cyclic messages, after a jump of the time that is passed to `cyclic`."""
 
 
 PROTOCOLS: Final[Mapping[str, str]] = MappingProxyType(
@@ -185,23 +185,23 @@ PROTOCOLS: Final[Mapping[str, str]] = MappingProxyType(
         "dronecan": "protocol.motors.dronecan_esc",
     }
 )
-"""Name -> module with `Host`, `Drive` and `traffic(motor, rate_hz)`. Imported when first asked for."""
+"""Name -> module with `Host`, `Drive` and `traffic(motor, rate_hz)`. Imported at first use."""
 
 
 def make_host(name: str, motor: Motor) -> Host:
-    """The commanding end of a protocol. Raises UsageError for a name that is none."""
+    """The commanding end of a protocol. Raises UsageError for an unknown name."""
     host: Host = _module(name).Host(motor)
     return host
 
 
 def make_drive(name: str, motor: Motor) -> Drive:
-    """The drives' end of a protocol. Raises UsageError for a name that is none."""
+    """The drives' end of a protocol. Raises UsageError for an unknown name."""
     drive: Drive = _module(name).Drive(motor)
     return drive
 
 
 def traffic(name: str, motor: Motor, rate_hz: float) -> list[Traffic]:
-    """All that goes over the bus while torques are commanded at rate_hz. Raises UsageError for a name that is none."""
+    """All traffic on the bus while torques are commanded at rate_hz. Raises UsageError for an unknown name."""
     kinds: Iterable[Traffic] = _module(name).traffic(motor, rate_hz)
     return list(kinds)
 

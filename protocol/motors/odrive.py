@@ -1,16 +1,16 @@
 """ODrive CANSimple, firmware 0.6 (ODrive Pro, S1, Micro).
 
 Source: ODrive documentation, "CAN Protocol" (docs.odriverobotics.com/v/latest/manual/can-protocol.html), and the DBC that
-ODrive publishes for 0.6.10; our part of it stands in odrive.dbc, which is written for node 0. Firmware 0.5 differs:
-Get_Error (0x03) and Get_Temperature (0x15) have other contents there.
+ODrive publishes for 0.6.10; the part used here is in odrive.dbc, written for node 0. Firmware 0.5 differs in the contents
+of Get_Error (0x03) and Get_Temperature (0x15).
 
     identifier (11 bits)   node << 5 | message           all numbers little endian, float32, uint32, uint8
 
 Messages to a drive: Set_Axis_State, Set_Controller_Mode, Set_Input_Torque (4 bytes), Clear_Errors, Estop. From a drive:
-Heartbeat, Get_Encoder_Estimates and the other readings, each at a period of whole milliseconds or when it is asked for by
-a remote frame of the same identifier. No message is answered. Errors stay until Clear_Errors, and disarm the axis.
+Heartbeat, Get_Encoder_Estimates and the other readings, each at a period of whole milliseconds or when requested by a
+remote frame with the same identifier. No message is answered. Errors are latched until Clear_Errors, and disarm the axis.
 
-Torque is in N m (full scale is `full_scale_nm`), position in turns of the output shaft, as of an axis with a load encoder.
+Torque is in N m (full scale is `full_scale_nm`), position in turns of the output shaft, as for an axis with a load encoder.
 Source of the defaults: heartbeat_msg_rate_ms 100, encoder_msg_rate_ms 10; the others are off by default (0).
 """
 
@@ -116,7 +116,7 @@ class Host(motor_protocol.Host):
 
 
 class Drive(motor_protocol.Drive):
-    """Six axes. An axis that is not in closed loop takes torques, and acts on none of them."""
+    """Six axes. An axis that is not in closed-loop control accepts torque commands but ignores them."""
 
     def __init__(self, motor: Motor) -> None:
         super().__init__(motor)

@@ -1,19 +1,19 @@
-"""Frames that exist in simulation only: they give a bus that carries no time the lockstep it needs.
+"""Frames that exist in simulation only: they add lockstep to a bus that has no time.
 
-Layout in simulation_sync.dbc, whose node SIMULATION_ONLY says so. All are classical frames with identifiers of 11 bits, so
-that any interface carries them, and DroneCAN, which speaks 29 bits only, never sees one. ODrive nodes from 44 on and MIT
-drives from 0x580 on would share them, and are refused by the scenario (`motor.first_node_id`).
+Layout in simulation_sync.dbc, under the node SIMULATION_ONLY. All are classical frames with 11-bit identifiers, so that any
+interface carries them, and DroneCAN, with 29-bit identifiers only, ignores them. ODrive nodes from 44 on and MIT drives from
+0x580 on would use the same identifiers, and are refused by the scenario (`motor.first_node_id`).
 
-    SYNC      0x580                      t_ns (56 bits), which axes were commanded since the last one (6), lockstep (bit 63)
-    HELLO     0x581 host, 0x582 drives   the scenario's digest (8 bytes); the drives answer the host's, and say it before
-                                         the first answers where they join a run that is under way
+    SYNC      0x580                      t_ns (56 bits), axes commanded since the last SYNC (6 bits), lockstep (bit 63)
+    HELLO     0x581 host, 0x582 drives   the scenario's digest (8 bytes); the drives answer the host's, and send it before
+                                         their first answers when they join a run in progress
     ENCODERS  0x590 + axis               shaft angles before and after the gear (rad, float32 each), quantised
-    ANSWER    0x600 + 64 axis + 32 enabled + tick mod 32      u (float64): the force of the gear's output, every bit of it
+    ANSWER    0x600 + 64 axis + 32 enabled + tick mod 32      u (float64): the exact force at the gear output
 
-A number of 64 bits fills a classical frame, so the tick of an ANSWER travels in its identifier. Only one tick is ever under
-way and frames keep their order, so five bits tell a late copy from the answer that is waited for. SYNC repeats the set
-of commanded axes, so that a drive that lost its command waits for the repetition and never answers from an old one. 7 bytes
-of nanoseconds are 2.3 years.
+A 64-bit number fills a classical frame, so the tick of an ANSWER is in its identifier. Only one tick is in progress at a time
+and frames keep their order, so five bits distinguish a late duplicate from the expected answer. SYNC repeats the set of
+commanded axes, so that a drive that lost its command waits for the repetition and never answers with an old one. 7 bytes of
+nanoseconds are 2.3 years.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ HELLO_DRIVES: Final = 0x582
 ENCODERS: Final = 0x590
 ANSWER: Final = 0x600
 ANSWER_MASK: Final = 0x7C0
-"""The bits of an ANSWER's identifier that its message in the DBC has."""
+"""The bits of an ANSWER's identifier that are in its identifier in the DBC."""
 ALL_AXES: Final = (1 << DRIVES) - 1
 TICKS: Final = 32
 
@@ -43,7 +43,7 @@ _DIGEST_BYTES = 8
 class Sync(NamedTuple):
     """t_ns: simulation time. commanded: bit i set where axis i was commanded since the last SYNC.
 
-    lockstep: simulation time stands still until all have answered, however long that takes.
+    lockstep: simulation time stands still until all have answered.
     """
 
     t_ns: int
@@ -52,7 +52,7 @@ class Sync(NamedTuple):
 
 
 class SyncAnswer(NamedTuple):
-    """tick: modulo TICKS. u: the gear's output, N or N m. enabled: the drive follows commands."""
+    """tick: modulo TICKS. u: force at the gear output, N or N m. enabled: the drive follows commands."""
 
     axis: int
     tick: int
@@ -69,7 +69,7 @@ def is_simulation_only(frame: CanFrame) -> bool:
 
 
 def encode_sync(t_ns: int, commanded: int = ALL_AXES, *, lockstep: bool = True) -> CanFrame:
-    """The frame that gives the drives the time."""
+    """The frame that sends the time to the drives."""
     return CanFrame(SYNC, (t_ns | commanded << 56 | lockstep << 63).to_bytes(8, "little"))
 
 
@@ -87,7 +87,7 @@ def encode_answer(axis: int, tick: int, u: float, *, enabled: bool) -> CanFrame:
 
 
 def decode_answer(frame: CanFrame) -> SyncAnswer | None:
-    """What an ANSWER says; None for any other frame, and for a u that is not finite."""
+    """The content of an ANSWER; None for any other frame, and for a u that is not finite."""
     can_id = frame.can_id
     if not _is_answer(can_id) or frame.extended or len(frame.data) != 8:
         return None
@@ -99,12 +99,12 @@ def decode_answer(frame: CanFrame) -> SyncAnswer | None:
 
 
 def encode_hello(digest: bytes, *, drives: bool) -> CanFrame:
-    """The frame by which an end shows the digest (8 bytes) of its scenario."""
+    """The frame with which an end sends the digest (8 bytes) of its scenario."""
     return CanFrame(HELLO_DRIVES if drives else HELLO_HOST, digest)
 
 
 def decode_hello(frame: CanFrame, *, drives: bool) -> bytes | None:
-    """The digest that the drives (or the host) show; None for any other frame."""
+    """The digest in a HELLO of the drives (or the host); None for any other frame."""
     if frame.can_id != (HELLO_DRIVES if drives else HELLO_HOST) or frame.extended or len(frame.data) != _DIGEST_BYTES:
         return None
     return frame.data

@@ -1,7 +1,7 @@
 """MAVLink frames for callers in Python: layouts, generated from pymavlink's `common` dialect, a writer and a reader.
 
-`FrameWriter` numbers and seals frames; `FrameReader` finds them in whatever bytes arrive. A frame that cannot be taken is
-an event with a cause, counted in `FrameReader.counters`, never an exception. Source: the MAVLink 2 serialization guide.
+`FrameWriter` numbers and seals frames; `FrameReader` finds them in received bytes. A bad frame is dropped and counted by
+cause in `FrameReader.counters`; it never raises an exception. Source: the MAVLink 2 serialization guide.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from protocol.wire.framing import CAUSES, CRC_SIZE, HEADER_V2, KNOWN, LONGEST_FR
 
 _unpack_header = struct.Struct("<xBBxBBBHB").unpack_from  # without magic and compat; the id is 24 bits: 16 and 8
 _AT_ONCE = 256
-"""Frames that one look at the bytes describes; a datagram of more takes several."""
+"""Frames that one call describes; a datagram with more takes several calls."""
 
 _NUMBERS = {"uint8_t": "u1", "uint16_t": "<u2", "uint32_t": "<u4", "uint64_t": "<u8", "float": "<f4"}
 _NUMBERS |= {"int8_t": "i1", "int16_t": "<i2", "int32_t": "<i4", "int64_t": "<i8", "double": "<f8"}
@@ -35,8 +35,8 @@ class Layout:
     """One message of the dialect: its id, name, checksum seed, and its fields in wire order.
 
     `dtype` is the payload as a packed NumPy structure, fields by name.
-    `pack` takes the values in wire order, arrays flattened; `unpack` gives them back so. `pack_fields` and `unpack_fields`
-    do the same by name, for messages off the hot path. Strings are bytes, as long as their field when unpacked.
+    `pack` takes the values in wire order, arrays flattened; `unpack` returns them in this form. `pack_fields` and
+    `unpack_fields` do the same by name, for messages off the fast path. Strings are bytes, unpacked with the full field length.
     """
 
     def __init__(self, message: Any) -> None:
@@ -66,7 +66,7 @@ class Layout:
         return self._unpack(payload)
 
     def pack_fields(self, **values: Any) -> bytes:
-        """Payload from values by field name; a field left out is zero. Raises KeyError for a name the message lacks."""
+        """Payload from values by field name; missing fields are zero. Raises KeyError for an unknown name."""
         flat: list[Any] = []
         for field, length in zip(self.fields, self.array_lengths, strict=True):
             value = values.pop(field, None)
@@ -80,7 +80,7 @@ class Layout:
         return self.structure.pack(*flat)
 
     def unpack_fields(self, payload: bytes) -> dict[str, Any]:
-        """Values by field name; arrays as tuples."""
+        """Values by field name, arrays as tuples."""
         values = self.unpack(payload)
         named: dict[str, Any] = {}
         at = 0
@@ -106,7 +106,7 @@ def layout(name: str) -> Layout:
 
 
 class Frame(NamedTuple):
-    """A frame that passed its checksum. `payload` may lack trailing zeros; `raw` is the frame as it was on the wire."""
+    """A frame with a valid checksum. `payload` may lack trailing zeros; `raw` is the frame as it was on the wire."""
 
     message_id: int
     sequence: int
@@ -130,7 +130,7 @@ class FrameWriter:
         framing.seal_frame(self._out, 0, b"", 0, 0, system, component, 0, 0)  # compiled now, not with the first frame
 
     def seal(self, message: Layout, payload: bytes) -> bytes:
-        """One frame: trailing zeros of the payload cut off (one byte stays), header, checksum."""
+        """One frame: header, payload without trailing zeros (at least one byte), checksum."""
         sequence, out = self.sequence, self._out
         end = framing.seal_frame(
             out, 0, payload, 0, sequence, self.system, self.component, message.message_id, message.crc_seed
@@ -149,27 +149,27 @@ def table_of(messages: Iterable[Layout], ids: int) -> Table:
 
 @functools.cache
 def link_table() -> Table:
-    """The table of the dialect that is spoken on links."""
+    """The table of the dialect used on links."""
     return table_of(layouts_by_id().values(), 1 << 16)
 
 
 class FrameReader:
-    """Finds the frames in what a link delivers, and counts by cause what it cannot take; see `framing.next_frame`.
+    """Finds the frames in received data, and counts dropped ones by cause; see `framing.next_frame`.
 
-    counters   bad_crc          frames whose checksum failed
-               garbage_bytes    bytes that belong to no frame
-               unknown_message  well-formed frames of a message the dialect lacks (handed on all the same)
-               unknown_flags    frames with an incompatibility flag of unknown meaning, which must be dropped
+    counters   bad_crc          frames with a wrong checksum
+               garbage_bytes    bytes outside of any frame
+               unknown_message  well-formed frames of a message not in the dialect (returned all the same)
+               unknown_flags    frames with an unknown incompatibility flag, which must be dropped
                truncated        frames cut short by the end of their datagram
-               mavlink1         MAVLink 1 frames, which this contract does not use
-               sequence_gaps    frames lost, by the numbers of those that came
-               out_of_order     frames that came again, or late
+               mavlink1         MAVLink 1 frames, which the loop does not use
+               sequence_gaps    lost frames, by the sequence numbers received
+               out_of_order     repeated or late frames
 
     With follow_sequence False the last two count from the first call of `restart_sequences` on. With keep_mavlink1 True
-    MAVLink 1 frames are handed on too (for recorders), besides being counted.
+    MAVLink 1 frames are counted and also returned (for recorders).
 
-    reading, table, rows   what a kernel that reads frames itself gives to `framing.next_frame`; it begins with `whole` and
-                           ends with `keep_rest`
+    reading, table, rows   arguments of `framing.next_frame` for a kernel that reads frames itself, between calls of `whole`
+                           and `keep_rest`
     """
 
     def __init__(self, *, is_datagram: bool, follow_sequence: bool = True, keep_mavlink1: bool = False) -> None:
@@ -186,24 +186,24 @@ class FrameReader:
 
     @property
     def counters(self) -> dict[str, int]:
-        """What was counted so far, by cause."""
+        """Counters by cause."""
         return dict(zip(CAUSES, self._counted.tolist(), strict=True))
 
     def restart_sequences(self, expected: Iterable[tuple[int, int, int]] = ()) -> None:
-        """Forget the numbers seen; `expected` gives (system, component, next number) where they are known."""
+        """Forget the sequence numbers; `expected` gives (system, component, next number) where known."""
         self.reading["follow"] = 1
         self._next[:] = -1
         for system, component, number in expected:
             self._next[system << 8 | component] = number & 0xFF
 
     def whole(self, data: bytes) -> bytes:
-        """`data` behind what is left of a frame begun before, on a stream."""
+        """On a stream: `data` preceded by the unfinished frame of earlier data."""
         if self._rest:
             data, self._rest = self._rest + data, b""
         return data
 
     def keep_rest(self, data: bytes) -> None:
-        """Keep the unfinished frame at the end of `data`, all of which has been read, on a stream."""
+        """On a stream: keep the unfinished frame at the end of `data`, all of which has been read."""
         if not self._is_datagram:
             self._rest = data[self.reading["rest"].item() :]
 
@@ -227,7 +227,7 @@ class FrameReader:
 
 
 def lone_frame(data: bytes) -> Frame:
-    """The MAVLink 2 frame that is all of `data`, unsigned, already found to be intact."""
+    """The frame in `data`, which is exactly one intact, unsigned MAVLink 2 frame."""
     length, _, sequence, system, component, number, high = _unpack_header(data, 0)
     number |= high << 16
     return _new_frame(Frame, (number, sequence, system, component, data[HEADER_V2 : HEADER_V2 + length], data))

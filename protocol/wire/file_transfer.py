@@ -1,6 +1,6 @@
-"""FILE_TRANSFER_PROTOCOL, as far as this project speaks it: every request is refused. Source: the MAVLink FTP guide.
+"""FILE_TRANSFER_PROTOCOL: every request is refused. Source: the MAVLink FTP guide.
 
-Ground stations ask for a file of parameters first, and wait for seconds where nothing answers; a NAK sends them to the
+Ground stations first request a file of parameters, and wait for seconds without an answer; after a NAK they use the
 parameter protocol at once.
 
     payload   sequence (2 bytes) | session | opcode | size | opcode asked for | burst complete | 0 | offset (4) | data
@@ -19,13 +19,13 @@ _LARGEST_REQUEST = 127
 
 
 def encode_refusal(payload: bytes, me: tuple[int, int], asker: tuple[int, int]) -> bytes | None:
-    """FILE_TRANSFER_PROTOCOL payload that refuses a request; None where it is none, or not for (system, component) `me`."""
+    """FILE_TRANSFER_PROTOCOL payload that refuses a request; None if it is no request, or not for (system, component) `me`."""
     values = FILE_TRANSFER.unpack_fields(payload)
     request = bytes(values["payload"])
     if values["target_system"] not in (0, me[0]) or values["target_component"] not in (0, me[1]):
         return None
     if request[3] > _LARGEST_REQUEST:
-        return None  # an answer of somebody else's
+        return None  # a response, not a request
     sequence = (int.from_bytes(request[:2], "little") + 1) & 0xFFFF
     answer = sequence.to_bytes(2, "little") + bytes((request[2], _NAK, 1, request[3])) + bytes(_HEADER - 6)
     return FILE_TRANSFER.pack_fields(

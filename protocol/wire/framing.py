@@ -1,11 +1,11 @@
-"""MAVLink frames in compiled code: the one way a frame is taken apart, checked and put together, on links and in logs.
+"""MAVLink frames in compiled code: the only place where frames are parsed, checked and built, for links and logs.
 
     MAVLink 2   FD | length | incompat | compat | sequence | system | component | id (3 bytes) | payload | CRC | [signature 13]
     MAVLink 1   FE | length | sequence | system | component | id | payload | CRC
 
-`next_frame` finds frames in what a link delivers. On a datagram a bad frame ends where it says it ends, and nothing within
-it is looked at; what does not begin a frame there ends the datagram. On a stream the search goes on behind the bad start.
-`data` is `bytes`, or an array of them. Source: the MAVLink serialization guide.
+`next_frame` finds frames in received data. In a datagram a bad frame is skipped by its length field without searching inside
+it; a byte that does not begin a frame ends the datagram. In a stream the search continues after the bad start byte.
+`data` is `bytes`, or an array of bytes. Source: the MAVLink serialization guide.
 """
 
 from __future__ import annotations
@@ -59,14 +59,14 @@ ROW = np.dtype(
         ("component", "<i8"),
     ]
 )
-"""One frame in the bytes given: where it begins and ends (its signature included), where its payload begins, its length."""
+"""One frame in the given bytes: begin and end (including the signature) of the frame, begin and length of its payload."""
 
 
 def new_reading(*, is_datagram: bool, follow_sequence: bool, keep_mavlink1: bool) -> Packed:
-    """What a reader of one link remembers, as `next_frame` takes it.
+    """State of the reader of one link, for `next_frame`.
 
-    counters  by CAUSES            next   by system << 8 | component: the sequence number expected, -1: not known
-    rest      where an unfinished frame at the end of a stream's bytes begins
+    counters  by CAUSES            next   by system << 8 | component: the expected sequence number, -1: unknown
+    rest      begin of an unfinished frame at the end of a stream's bytes
     """
     return pack(
         {
@@ -100,16 +100,16 @@ _BY_HIGH_BYTE[_TABLES[0] >> 8] = np.arange(256, dtype=np.int32)  # the high byte
 
 @inlined
 def byte(data: Bytes, at: int) -> int:
-    """data[at] as a signed number; both casts are for speed and for numba's rules of types.
+    """data[at] as a signed number; both casts are needed for speed and because of numba's type rules.
 
-    An unsigned number and a signed one together would be a float; a signed index is first looked at for its sign.
+    numba makes a float of unsigned and signed operands, and checks the sign of a signed index.
     """
     return int(np.int64(data[np.uint64(at)]))
 
 
 @compiled
 def table_entry(row: int, number: int) -> int:
-    """One value of the checksum's tables."""
+    """One value of the checksum tables."""
     return int(_FLAT[np.uint64(row << 8 | number)])
 
 
@@ -145,7 +145,7 @@ def seeded(crc: int, seed: int) -> int:
 
 @compiled
 def seed_that_explains(crc: int, found: int) -> int:
-    """The seed with which a checksum becomes the one found behind a frame; -1 where there is none."""
+    """The seed that turns `crc` into the checksum found in a frame; -1 if no seed does."""
     rest = found ^ (crc >> 8)
     seed = int(_BY_HIGH_BYTE[rest >> 8])
     return (seed ^ crc & 0xFF) if table_entry(0, seed) == rest else -1
@@ -159,7 +159,7 @@ def uint16_at(data: Bytes, at: int) -> int:
 
 @compiled
 def frame_end(data: Bytes, at: int) -> int:
-    """Where the checksum of the frame that begins at `at` begins, going by its header; -1 where no frame begins."""
+    """Offset of the checksum of the frame at `at`, from its header; -1 where no frame begins."""
     if at + HEADER_V1 + CRC_SIZE > len(data):
         return -1
     if byte(data, at) == MAGIC_V2 and at + HEADER_V2 + CRC_SIZE <= len(data):
@@ -179,13 +179,13 @@ def message_of(data: Bytes, at: int) -> int:
 
 @compiled
 def signature_size(data: Bytes, at: int) -> int:
-    """Bytes of signature behind the checksum of the frame at `at`, going by its header."""
+    """Bytes of signature after the checksum of the frame at `at`, from its header."""
     return SIGNATURE_SIZE if byte(data, at) == MAGIC_V2 and byte(data, at + 2) & SIGNED else 0
 
 
 @compiled
 def _announced_end(data: Bytes, at: int) -> int:
-    """Where the frame whose first byte is at `at` says that it ends, its signature included; -1: its header is not whole."""
+    """End of the frame at `at` by its header, including the signature; -1: the header is incomplete."""
     if at + 3 > len(data):
         return -1
     header = HEADER_V2 if byte(data, at) == MAGIC_V2 else HEADER_V1
@@ -194,7 +194,7 @@ def _announced_end(data: Bytes, at: int) -> int:
 
 @compiled
 def _follow(reading: Any, key: int, sequence: int) -> None:
-    """Count what the sequence number of a frame says is missing, or came late."""
+    """Count lost frames, or a late frame, by the sequence number of a frame."""
     expected = int(reading.next[key])
     ahead = (sequence - expected) & 0xFF if expected >= 0 else 0
     if ahead < HALF_SEQUENCE:
@@ -206,10 +206,10 @@ def _follow(reading: Any, key: int, sequence: int) -> None:
 
 @compiled
 def _refusal(data: Bytes, at: int, end: int, table: Table) -> int:
-    """Why the frame between `at` and `end` cannot be taken: BAD_CRC or UNKNOWN_FLAGS; -1: it is intact; -2: not known here.
+    """Why the frame between `at` and `end` is rejected: BAD_CRC or UNKNOWN_FLAGS; -1: it is intact; -2: unknown message.
 
-    The checksum of a message that the table lacks cannot be verified: its length is believed only where the next frame, or
-    nothing, follows it.
+    The checksum of a message that is not in the table cannot be verified: its length is accepted only where another frame,
+    or nothing, follows it.
     """
     message = message_of(data, at)
     stop = end - signature_size(data, at) - CRC_SIZE
@@ -226,9 +226,9 @@ def _refusal(data: Bytes, at: int, end: int, table: Table) -> int:
 
 @compiled
 def next_frame(data: Bytes, at: int, reading: Any, table: Table, row: Any) -> int:
-    """Describe the next intact frame from `at` on in `row`, and return where it ends; -1 where there is none any more.
+    """Describe the next intact frame from `at` on in `row`, and return where it ends; -1 where no further frame is found.
 
-    What cannot be taken is counted by its cause; a frame of a message that the table lacks is counted and handed on.
+    Rejected data is counted by cause; a frame of a message that is not in the table is counted and also described.
     """
     counters, size = reading.counters, len(data)
     reading.rest = size
@@ -272,7 +272,7 @@ def next_frame(data: Bytes, at: int, reading: Any, table: Table, row: Any) -> in
 
 @compiled
 def read_frames(data: Bytes, at: int, reading: Packed, table: Table, rows: Any) -> tuple[int, int]:
-    """Describe frames from `at` on in `rows`; returns how many there are, and where to go on, -1 where all is read."""
+    """Describe frames from `at` on in `rows`; returns their number, and where to continue, -1 where all is read."""
     count = 0
     while count < len(rows):
         at = next_frame(data, at, reading[0], table, rows[count])
@@ -284,7 +284,7 @@ def read_frames(data: Bytes, at: int, reading: Packed, table: Table, rows: Any) 
 
 @compiled
 def take_payload(data: Bytes, row: Any, payload: Output) -> None:
-    """Fill `payload`, a message's own memory, with that of the frame described by `row`; zeros that were cut off return."""
+    """Fill `payload`, the memory of a message, from the frame described by `row`; zeros that were cut off are restored."""
     length = min(int(row.length), len(payload))
     for i in range(length):
         payload[i] = data[np.uint64(row.payload + i)]
@@ -296,7 +296,7 @@ def take_payload(data: Bytes, row: Any, payload: Output) -> None:
 def seal_frame(
     out: Output, at: int, payload: Bytes, flags: int, sequence: int, system: int, component: int, message_id: int, seed: int
 ) -> int:  # fmt: skip
-    """Write a MAVLink 2 frame into out[at:], trailing zeros of the payload cut off; returns where its checksum ends."""
+    """Write a MAVLink 2 frame into out[at:], without trailing zeros of the payload; returns where its checksum ends."""
     length = len(payload)
     while length > 1 and byte(payload, length - 1) == 0:
         length -= 1

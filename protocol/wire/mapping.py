@@ -1,8 +1,8 @@
-"""Our messages as MAVLink messages and back: scale, range, resolution and the meaning of NaN, one function each way.
+"""Mapping between our messages and MAVLink: scale, range, resolution and the meaning of NaN, one function each way.
 
 Positions and quaternions travel as float32, commands as float32 fractions of the scenario's scale. The compiled functions
-at the top are that mapping; the in-process simulation applies the very same ones, so that it equals the wire to the bit.
-A payload that holds bad data (NaN where a number must be, a quaternion that is not unit) decodes to None.
+at the top define this mapping; the in-process simulation uses the same functions, so that its results are bit-identical.
+A payload with bad data (NaN instead of a number, a quaternion that is not of unit length) decodes to None.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ CAN_FRAME = layout("CAN_FRAME")
 UNIT_TOLERANCE = 1e-3
 """How far the length of a quaternion may be from one."""
 ALL_SENSORS = 0x1FFF
-"""HIL_SENSOR.fields_updated with the bits of every group: accelerometer, gyroscope, magnetometer, pressures, temperature."""
+"""HIL_SENSOR.fields_updated with the bits of all groups: accelerometer, gyroscope, magnetometer, pressures, temperature."""
 LOCKSTEP_FLAG = 1
 ARMED = common.MAV_MODE_FLAG_SAFETY_ARMED
 HIL = common.MAV_MODE_FLAG_HIL_ENABLED
@@ -52,7 +52,7 @@ def _float32(value: float) -> float:
 
 @compiled
 def pose_to_wire(q: FloatArray, wire: FloatArray) -> None:
-    """Fill `wire` (7,) with what ATT_POS_MOCAP carries of q (6,): quaternion w x y z, then x y z, float32 values."""
+    """Fill `wire` (7,) with q (6,) as carried by ATT_POS_MOCAP: quaternion w x y z, then x y z, float32 values."""
     w, x, y, z = quaternion_from_euler(q[3], q[4], q[5])
     wire[0] = _float32(w)
     wire[1] = _float32(x)
@@ -73,7 +73,7 @@ def pose_from_wire(wire: FloatArray, q: FloatArray) -> None:
 
 @compiled
 def fill_pose(message: Any, t_us: int, q: FloatArray) -> None:
-    """Fill an ATT_POS_MOCAP structure: covariance unknown (its first value NaN), and no velocity, which it does not have."""
+    """Fill an ATT_POS_MOCAP structure: covariance unknown (first value NaN); the message has no velocity."""
     w, x, y, z = quaternion_from_euler(q[3], q[4], q[5])
     message.time_usec = t_us
     message.q[0] = w
@@ -88,13 +88,13 @@ def fill_pose(message: Any, t_us: int, q: FloatArray) -> None:
 
 @compiled
 def read_pose(message: Any, q: FloatArray) -> bool:
-    """Fill q (6,) from an ATT_POS_MOCAP structure; False where it holds no pose."""
+    """Fill q (6,) from an ATT_POS_MOCAP structure; False where it has no valid pose."""
     wire = np.empty(7)
     for i in range(4):
         wire[i] = message.q[i]
     wire[4], wire[5], wire[6] = message.x, message.y, message.z
     length_squared = wire[0] * wire[0] + wire[1] * wire[1] + wire[2] * wire[2] + wire[3] * wire[3]
-    if not abs(length_squared - 1.0) < 2.0 * UNIT_TOLERANCE:  # written so that NaN fails it
+    if not abs(length_squared - 1.0) < 2.0 * UNIT_TOLERANCE:  # written so that NaN fails the test
         return False
     if not math.isfinite(wire[4] + wire[5] + wire[6]):
         return False
@@ -144,7 +144,7 @@ def read_command(message: Any, scale: FloatArray, tau: FloatArray) -> bool:
 
 @compiled
 def command_to_wire(tau: float, scale: float) -> float:
-    """What HIL_ACTUATOR_CONTROLS carries of one channel: the float32 fraction of its scale."""
+    """One channel as carried by HIL_ACTUATOR_CONTROLS: the float32 fraction of its scale."""
     return _float32(tau / scale)
 
 
@@ -155,7 +155,7 @@ def command_from_wire(control: float, scale: float) -> float:
 
 
 def _structure(message: Layout, payload: bytes) -> Packed:
-    """A payload as the structure of its message; zeros that were cut off return."""
+    """A payload as the structure of its message; zeros that were cut off are restored."""
     return np.frombuffer(payload.ljust(message.size, b"\0"), message.dtype, 1)
 
 
@@ -184,19 +184,19 @@ def encode_tick(t_ns: int, readings: FloatArray) -> bytes:
 
 
 def decode_tick_time_ns(payload: bytes) -> int:
-    """Simulation time of a HIL_SENSOR: all that the controller reads of it."""
+    """Simulation time of a HIL_SENSOR, the only field that the controller reads."""
     return int.from_bytes(payload[:8].ljust(8, b"\0"), "little") * 1000
 
 
 def tick_sensor_id(payload: bytes) -> int:
-    """Which instance a HIL_SENSOR speaks for; the tick is instance 0."""
+    """Sensor instance of a HIL_SENSOR; the tick is instance 0."""
     return payload[TICK_BASE] if len(payload) > TICK_BASE else 0
 
 
 def encode_gps(t_ns: int, latitude_deg: float, longitude_deg: float, altitude: float, velocity: FloatArray) -> bytes:
     """HIL_GPS payload, 3D fix. Velocity north, east, down in m/s; eph and epv in cm (as PX4 reads them).
 
-    What a field cannot hold is held at its end: a plant far away is no reason to stop.
+    Values are saturated at the range of their field, so that a distant plant does not stop the run.
     """
     north, east, down = (saturated(100.0 * v, 32767) for v in velocity)
     speed = saturated(100.0 * math.hypot(velocity[0], velocity[1]), 65534)
@@ -219,7 +219,7 @@ def encode_gps(t_ns: int, latitude_deg: float, longitude_deg: float, altitude: f
 
 
 def saturated(value: float, limit: int) -> int:
-    """The nearest whole number within +-limit."""
+    """The value rounded to a whole number and saturated at +-limit."""
     return round(max(-limit, min(limit, value)))
 
 
@@ -232,7 +232,7 @@ def encode_command(command: ActuatorCommand, scale: FloatArray, *, lockstep: boo
 
 
 def decode_command(payload: bytes, scale: FloatArray) -> ActuatorCommand | None:
-    """The command, or None where a control of the six is not finite; scale (6,)."""
+    """The command, or None where one of the six controls is not finite; scale (6,)."""
     message, tau = _structure(COMMAND, payload), np.empty(6)
     if not read_command(message[0], np.asarray(scale, dtype=float), tau):
         return None
@@ -245,7 +245,7 @@ def is_armed(payload: bytes) -> bool:
 
 
 def encode_controller_heartbeat(*, armed: bool, ending: bool = False) -> bytes:
-    """HEARTBEAT of the vehicle: flapping wing, generic autopilot, HIL on."""
+    """HEARTBEAT of the vehicle: flapping wing, generic autopilot, HIL enabled."""
     return HEARTBEAT.pack_fields(
         type=common.MAV_TYPE_FLAPPING_WING,
         autopilot=common.MAV_AUTOPILOT_GENERIC,
@@ -256,7 +256,7 @@ def encode_controller_heartbeat(*, armed: bool, ending: bool = False) -> bytes:
 
 
 def encode_emulator_heartbeat(*, ending: bool = False) -> bytes:
-    """HEARTBEAT of the simulator: no autopilot. `ending` says that the run is over."""
+    """HEARTBEAT of the simulator: no autopilot. `ending`: the run is over."""
     return HEARTBEAT.pack_fields(
         type=common.MAV_TYPE_GENERIC,
         autopilot=common.MAV_AUTOPILOT_INVALID,
@@ -272,7 +272,7 @@ def _status(*, armed: bool, ending: bool) -> int:
 
 
 def heartbeat_is_armed(payload: bytes) -> bool:
-    """Whether the sender of a HEARTBEAT says it is armed."""
+    """Whether the sender of a HEARTBEAT is armed."""
     return bool(HEARTBEAT.unpack_fields(payload)["base_mode"] & ARMED)
 
 
@@ -284,7 +284,7 @@ def heartbeat_is_ending(payload: bytes) -> bool:
 def encode_version(digest: bytes, *, has_parameters: bool = False) -> bytes:
     """AUTOPILOT_VERSION payload with the scenario's digest (8 bytes) as flight_custom_version.
 
-    has_parameters: the sender has some, floats as floats and integers bytewise.
+    has_parameters: the sender has parameters, floats as floats and integers bytewise.
     """
     capabilities = common.MAV_PROTOCOL_CAPABILITY_MAVLINK2
     if has_parameters:
@@ -294,7 +294,7 @@ def encode_version(digest: bytes, *, has_parameters: bool = False) -> bytes:
 
 
 def decode_version(payload: bytes) -> bytes:
-    """The 8 bytes of the sender's scenario."""
+    """The digest (8 bytes) of the sender's scenario."""
     return bytes(VERSION.unpack_fields(payload)["flight_custom_version"])
 
 
@@ -324,7 +324,7 @@ def encode_attitude_target(t_ns: int, q: FloatArray) -> bytes:
 
 
 def encode_timesync(answer_ns: int, asked_ns: int) -> bytes:
-    """TIMESYNC payload: tc1 (0 in a question) and ts1, both ns of the clock of who fills them in."""
+    """TIMESYNC payload: tc1 (responder's clock, 0 in a request) and ts1 (requester's clock), ns."""
     return TIMESYNC.pack_fields(tc1=answer_ns, ts1=asked_ns)
 
 
@@ -339,13 +339,13 @@ _CAN_REMOTE = 1 << 30
 
 
 def encode_can_frame(frame: CanFrame) -> bytes:
-    """CAN_FRAME payload, bus 0, for whoever listens; bit 31 of the identifier marks 29 bits, bit 30 a remote frame."""
+    """CAN_FRAME payload, bus 0, for all receivers; bit 31 of the identifier marks 29 bits, bit 30 a remote frame."""
     flags = (_CAN_EXTENDED if frame.extended else 0) | (_CAN_REMOTE if frame.remote else 0)
     return CAN_FRAME.pack_fields(id=frame.can_id | flags, len=len(frame.data), data=frame.data)
 
 
 def decode_can_frame(payload: bytes) -> CanFrame | None:
-    """The frame in a CAN_FRAME for us on bus 0; None where it is for somebody else or no classical frame."""
+    """The frame in a CAN_FRAME for bus 0; None where it is for another bus or is not a classical frame."""
     values = CAN_FRAME.unpack_fields(payload)
     extended, remote = bool(values["id"] & _CAN_EXTENDED), bool(values["id"] & _CAN_REMOTE)
     can_id = values["id"] & (EXTENDED_IDS - 1)

@@ -1,7 +1,7 @@
-"""What a plain mavutil script makes of the same messages: measured beside ours by `fwav-hil latency --against`, never used.
+"""A simple mavutil script with the same messages: a reference that `fwav-hil latency --against` measures.
 
-`python -m protocol.wire.mavutil_peer` writes its port, then answers each HIL_SENSOR with HIL_ACTUATOR_CONTROLS; it ends with
-its parent.
+`python -m protocol.wire.mavutil_peer` prints its port, then answers each HIL_SENSOR with HIL_ACTUATOR_CONTROLS until its
+parent ends.
 """
 
 from __future__ import annotations

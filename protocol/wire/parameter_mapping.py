@@ -1,6 +1,6 @@
-"""The MAVLink parameter protocol as bytes. Source: the MAVLink guide of it; integers travel bytewise, not as a float's value.
+"""Payloads of the MAVLink parameter protocol. Source: the MAVLink guide on it, with bytewise encoding of integers.
 
-PARAM_VALUE and PARAM_SET have one field of four bytes for the value: a float32, or the bytes of an integer.
+PARAM_VALUE and PARAM_SET have a value field of four bytes: a float32, or the bytes of an integer.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ _BY_NAME = -1
 
 
 class Kind(enum.IntEnum):
-    """MAV_PARAM_TYPE of the parameters that there are here."""
+    """MAV_PARAM_TYPE of the parameter types used here."""
 
     INT32 = common.MAV_PARAM_TYPE_INT32
     REAL32 = common.MAV_PARAM_TYPE_REAL32
 
 
 class Refusal(enum.IntEnum):
-    """MAV_PARAM_ERROR: why a parameter was not given or not set."""
+    """MAV_PARAM_ERROR: why a parameter was not sent or not set."""
 
     UNKNOWN = common.MAV_PARAM_ERROR_DOES_NOT_EXIST
     OUT_OF_RANGE = common.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
@@ -44,7 +44,7 @@ _NUMBERS = {Kind.INT32: struct.Struct("<i"), Kind.REAL32: struct.Struct("<f")}
 
 
 class Wanted(NamedTuple):
-    """Which parameter a peer asks for or sets: by name, or by number, its index (then the name is empty); None: no value."""
+    """A parameter that a peer requests or sets, by name or by index (`number`; the name is then empty); None: no value."""
 
     target: tuple[int, int]
     name: str
@@ -54,39 +54,39 @@ class Wanted(NamedTuple):
 
 
 def encode_value(name: str, kind: Kind, value: float, index: int, count: int) -> bytes:
-    """PARAM_VALUE payload of a parameter, one of `count`."""
+    """PARAM_VALUE payload of one of `count` parameters."""
     payload = VALUE.pack_fields(param_id=name.encode(), param_type=int(kind), param_index=index, param_count=count)
     number = value if kind is Kind.REAL32 else int(value)
     return _NUMBERS[kind].pack(number) + payload[_VALUE_BYTES:]
 
 
 def decode_value(payload: bytes) -> tuple[str, float | None]:
-    """(name, value) of a PARAM_VALUE; None where its type is none of ours."""
+    """(name, value) of a PARAM_VALUE; the value is None where its type is not in `Kind`."""
     values = VALUE.unpack_fields(payload)
     return _name(values["param_id"]), _number(payload, values["param_type"])
 
 
 def encode_error(target: tuple[int, int], name: str, index: int, refusal: Refusal) -> bytes:
-    """PARAM_ERROR payload, to who asked."""
+    """PARAM_ERROR payload, addressed to the peer that sent the request."""
     return ERROR.pack_fields(
         target_system=target[0], target_component=target[1], param_id=name.encode(), param_index=index, error=refusal
     )
 
 
 def decode_list(payload: bytes) -> Wanted:
-    """Whom a PARAM_REQUEST_LIST asks."""
+    """The target of a PARAM_REQUEST_LIST."""
     return Wanted(_target(LIST.unpack_fields(payload)), "")
 
 
 def decode_read(payload: bytes) -> Wanted:
-    """What a PARAM_REQUEST_READ asks for."""
+    """The parameter that a PARAM_REQUEST_READ requests."""
     values = READ.unpack_fields(payload)
     index = int(values["param_index"])
     return Wanted(_target(values), _name(values["param_id"]) if index == _BY_NAME else "", index)
 
 
 def decode_set(payload: bytes) -> Wanted:
-    """What a PARAM_SET sets; value None where its type is none of ours."""
+    """The parameter and value of a PARAM_SET; value None where its type is not in `Kind`."""
     values = SET.unpack_fields(payload)
     kind = int(values["param_type"])
     return Wanted(_target(values), _name(values["param_id"]), value=_number(payload, kind), kind=kind)

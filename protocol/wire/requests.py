@@ -1,6 +1,6 @@
-"""What a peer asks of a component (COMMAND_LONG) and the answer (COMMAND_ACK). Source: the MAVLink command protocol.
+"""Requests to a component (COMMAND_LONG) and their acknowledgement (COMMAND_ACK). Source: the MAVLink command protocol.
 
-NaN is legal in parameters that a command does not use; in those it does use it makes the request a wrong one.
+NaN is allowed in parameters that a command does not use; in a used parameter it makes the request invalid.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CAN_FORWARD = common.MAV_CMD_CAN_FORWARD
 
 
 class Result(enum.IntEnum):
-    """MAV_RESULT: obeyed; not now; never with these parameters; a command that is not known here."""
+    """MAV_RESULT: accepted; not now; never with these parameters; unknown command."""
 
     ACCEPTED = common.MAV_RESULT_ACCEPTED
     NOT_NOW = common.MAV_RESULT_TEMPORARILY_REJECTED
@@ -30,7 +30,7 @@ class Result(enum.IntEnum):
 
 
 class Request(NamedTuple):
-    """A COMMAND_LONG: the number of the command, whom it is for (0: all), its seven parameters."""
+    """A COMMAND_LONG: the number of the command, its target (0: all), its seven parameters."""
 
     command: int
     target_system: int
@@ -38,7 +38,7 @@ class Request(NamedTuple):
     parameters: tuple[float, ...]
 
     def is_for(self, who: tuple[int, int]) -> bool:
-        """Whether (system, component) `who` is meant, be it as one of all."""
+        """Whether (system, component) `who` is addressed, alone or with all others."""
         return self.target_system in (0, who[0]) and self.target_component in (0, who[1])
 
 
@@ -50,30 +50,30 @@ def decode_request(payload: bytes) -> Request:
 
 
 def encode_acknowledgement(command: int, result: Result, asker: tuple[int, int] = (0, 0)) -> bytes:
-    """COMMAND_ACK payload, for the (system, component) that asked."""
+    """COMMAND_ACK payload, for the (system, component) that sent the request."""
     return COMMAND_ACK.pack_fields(
         command=command, result=int(result), target_system=asker[0], target_component=asker[1]
     )
 
 
 def wanted_arming(request: Request) -> bool | None:
-    """Whether MAV_CMD_COMPONENT_ARM_DISARM asks to arm (1) or to disarm (0); None where it says neither."""
+    """Whether MAV_CMD_COMPONENT_ARM_DISARM requests to arm (1) or to disarm (0); None for any other value."""
     return {1.0: True, 0.0: False}.get(request.parameters[0])
 
 
 def wanted_bus(request: Request) -> int | None:
-    """The bus (from 1 on; 0 ends it) that MAV_CMD_CAN_FORWARD wants; None where it is no number."""
+    """The bus (counted from 1; 0 stops) that MAV_CMD_CAN_FORWARD requests; None where it is not finite."""
     bus = request.parameters[0]
     return int(bus) if math.isfinite(bus) else None
 
 
 def wanted_message(request: Request) -> int | None:
-    """The message id that 511 or 512 is about; None where it is none."""
+    """The message id in command 511 or 512; None where it is not valid."""
     number = request.parameters[0]
     return int(number) if math.isfinite(number) and number == int(number) and number >= 0 else None
 
 
 def wanted_interval_us(request: Request) -> float | None:
-    """The interval of MAV_CMD_SET_MESSAGE_INTERVAL: -1 none at all, 0 the default; None where it is neither, nor positive."""
+    """The interval of MAV_CMD_SET_MESSAGE_INTERVAL: positive, -1: stop, 0: default; None for any other value."""
     interval_us = request.parameters[1]
     return interval_us if math.isfinite(interval_us) and (interval_us >= 0.0 or interval_us == -1.0) else None

@@ -1,7 +1,7 @@
-"""What one component says on one link, and when: one scheduler over the table of streams.
+"""The messages of one component on one link, and when they are sent: one scheduler over the table of streams.
 
-A message is said at its rate, once when asked for, or as an answer. The order within one occasion is: answers, then the
-messages in the order of the table, so that equal runs say equal bytes.
+A message is sent at its rate, once on request, or as an answer. The order of messages due together is: answers, then the
+others in the order of the table, so that equal runs send equal bytes.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from protocol.wire.codec import Layout, layout
 from protocol.wire.streams import STREAMS
 
 Saying: TypeAlias = tuple[Layout, bytes]
-"""A message and its payload, not yet sealed."""
+"""A message and its payload, not yet sealed as a frame."""
 Encoder: TypeAlias = Callable[[int], Iterable[Saying]]
-"""Makes what a stream says at a time (ns): one message, several, or none."""
+"""Makes the messages of a stream at a time (ns): one, several, or none."""
 
 
 class Schedule:
     """The streams of one component on one link.
 
-    encoders   by message name: what makes each. A new message is a row of the table and an entry here.
-    rates_hz   where they are other than the table's; None: said when asked for
+    encoders   encoder by message name. A new message needs a row of the table and an entry here.
+    rates_hz   rates that differ from the table's; None: sent on request only
 
-    next_ns   until then nothing is due
+    next_ns   when the next message is due
     """
 
     def __init__(self, encoders: Mapping[str, Encoder], rates_hz: Mapping[str, float | None] | None = None) -> None:
@@ -40,29 +40,29 @@ class Schedule:
         self.next_ns = 0
 
     def answer(self, *sayings: Saying) -> None:
-        """Have something said at the next occasion, before all else."""
+        """Send these messages with the next ones, before all others."""
         self._answers += sayings
         self.next_ns = 0
 
     def ask_once(self, number: int) -> None:
-        """Have a message said at the next occasion. Raises KeyError for an id that has no encoder."""
+        """Send a message once, with the next ones. Raises KeyError for an id without encoder."""
         self._once.add(self._known(number))
         self.next_ns = 0
 
     def set_rate(self, number: int, rate_hz: float | None) -> None:
-        """Have a message said at a rate from now on; None: no longer. Raises KeyError for an id that has no encoder."""
+        """Send a message at a rate from now on; None: stop. Raises KeyError for an id without encoder."""
         self._due.pop(self._known(number), None)
         if rate_hz:
             self._due[number] = Due(rate_hz)
         self.next_ns = 0
 
     def answers(self) -> list[Saying]:
-        """The answers alone, for occasions at which nothing else is said."""
+        """The pending answers only."""
         answers, self._answers = self._answers, []
         return answers
 
     def due(self, t_ns: int) -> list[Saying]:
-        """What is to be said at t_ns."""
+        """The messages to send at t_ns."""
         if t_ns < self.next_ns:
             return []
         sayings = self.answers()
@@ -77,5 +77,5 @@ class Schedule:
 
     def _known(self, number: int) -> int:
         if number not in self._encoders:
-            raise KeyError(f"no message {number} is said here")
+            raise KeyError(f"message {number} has no encoder here")
         return number

@@ -1,9 +1,9 @@
 """Signatures of MAVLink 2 frames, made and verified. Source: the MAVLink 2 guide on message signing.
 
     signature   link id | timestamp (6 bytes, 10 us since 2015) | digest (6 bytes)
-    digest      the first of SHA-256(key | frame to its checksum | link id | timestamp)
+    digest      first 6 bytes of SHA-256(key | frame to its checksum | link id | timestamp)
 
-Timestamps of one stream (system, component, link id) only grow; the first may be a minute older than this machine's clock.
+Timestamps of one stream (system, component, link id) must increase; the first may be a minute behind this machine's clock.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _DIGEST = 6
 
 
 class Verdict(enum.Enum):
-    """What a signature is worth; all but the first are causes to drop the frame."""
+    """Result of checking a signature; all but the first are causes to drop the frame."""
 
     GOOD = "signed"
     MISSING = "unsigned"
@@ -49,24 +49,24 @@ def read_key(path: Path) -> bytes:
 
 
 def _with_flags(raw: bytes, flags: int, message: Layout) -> bytes:
-    """The MAVLink 2 frame with other incompatibility flags, its checksum made to fit, and without a signature."""
+    """The MAVLink 2 frame with other incompatibility flags and a new checksum, without a signature."""
     stop = HEADER_V2 + raw[1]
     body = raw[:2] + bytes((flags,)) + raw[3:stop]
     return body + checksum(body, 1, stop, message.crc_seed).to_bytes(CRC_SIZE, "little")
 
 
 def strip(raw: bytes) -> bytes | None:
-    """The frame without its signature; None where its message is not known, so that no checksum can be made for it."""
+    """The frame without its signature; None for an unknown message, whose checksum cannot be computed."""
     message = layouts_by_id().get(message_of(raw, 0))
     return _with_flags(raw, raw[2] & ~SIGNED, message) if message else None
 
 
 class Signatures:
-    """Signs what one end of a link says, and verifies what it hears, with the key of both.
+    """Signs the frames that one end of a link sends, and verifies those that it receives, with the shared key.
 
     now_us is the time since 1970; messages: those that can be signed, by default those of the links' dialect.
 
-    signed, unsigned   how many frames were, and how many could not be: MAVLink 1, and those of other messages
+    signed, unsigned   number of frames signed, and of those that could not be: MAVLink 1 and other messages
     """
 
     def __init__(self, key: bytes, link_id: int = 0, messages: Mapping[int, Layout] | None = None) -> None:
@@ -78,7 +78,7 @@ class Signatures:
         self._newest: dict[tuple[int, int, int], int] = {}
 
     def sign(self, raw: bytes, now_us: int) -> bytes:
-        """The frame, signed, a signature that it had replaced; one that cannot be signed stays as it is."""
+        """The signed frame, an earlier signature replaced; a frame that cannot be signed is returned unchanged."""
         message = self._messages.get(message_of(raw, 0)) if raw[0] == MAGIC_V2 else None
         if message is None:
             self.unsigned += 1
@@ -90,7 +90,7 @@ class Signatures:
         return stamped + self._digest(stamped)
 
     def verify(self, raw: bytes, now_us: int) -> Verdict:
-        """Whether an intact frame that was received may be believed; a good one's time becomes its stream's newest."""
+        """Check the signature of an intact received frame; a good one's timestamp becomes the newest of its stream."""
         if raw[0] != MAGIC_V2 or not raw[2] & SIGNED or len(raw) != HEADER_V2 + raw[1] + CRC_SIZE + SIGNATURE_SIZE:
             return Verdict.MISSING
         if not hmac.compare_digest(self._digest(raw[:-_DIGEST]), raw[-_DIGEST:]):

@@ -1,6 +1,6 @@
-"""Every message of the link in one table: who says it, when, what it is for. The README's table is printed from it.
+"""All messages of the link in one table: sender, rate, purpose. The README's table is printed from it.
 
-`rate_hz` is the rate of a stream in simulation time; None means once for each tick, or on an event (see `rule`).
+`rate_hz` is the rate of a stream in simulation time; None means once per tick, or on an event (see `rule`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ HEARTBEAT_TIMEOUT_NS = 3 * NANOSECONDS
 
 
 class End(enum.Enum):
-    """Who sends."""
+    """The sender of a message."""
 
     EMULATOR = "emulator"
     CONTROLLER = "controller"
@@ -24,7 +24,7 @@ class End(enum.Enum):
 
 
 class Stream(NamedTuple):
-    """One row: a MAVLink message, its sender, its rate and its rule; each_tick: one of it for every tick."""
+    """One row: a MAVLink message, its sender, its rate and its rule; each_tick: sent once per tick."""
 
     message: str
     sender: End
@@ -34,7 +34,7 @@ class Stream(NamedTuple):
 
 
 STREAMS = (
-    Stream("HEARTBEAT", End.BOTH, 1.0, "who is there, and whether the controller is armed; lost after 3 s"),
+    Stream("HEARTBEAT", End.BOTH, 1.0, "presence of each end, and whether the controller is armed; timeout 3 s"),
     Stream(
         "AUTOPILOT_VERSION", End.BOTH, None, "at the start: 8 bytes of the scenario's digest; a mismatch is refused"
     ),
@@ -54,11 +54,11 @@ STREAMS = (
     ),
     Stream("POSITION_TARGET_LOCAL_NED", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
     Stream("ATTITUDE_TARGET", End.CONTROLLER, 50.0, "the reference at the sample's time, for the log"),
-    Stream("PARAM_REQUEST_LIST", End.STATION, None, "to the controller, on its station's link: all of them"),
-    Stream("PARAM_REQUEST_READ", End.STATION, None, "one of them"),
+    Stream("PARAM_REQUEST_LIST", End.STATION, None, "to the controller, on its station's link: all parameters"),
+    Stream("PARAM_REQUEST_READ", End.STATION, None, "one parameter"),
     Stream("PARAM_SET", End.STATION, None, "a gain, while disarmed"),
-    Stream("PARAM_ERROR", End.CONTROLLER, None, "why one was not given or not set"),
-    Stream("FILE_TRANSFER_PROTOCOL", End.CONTROLLER, None, "the refusal of files, for which stations ask first"),
+    Stream("PARAM_ERROR", End.CONTROLLER, None, "why a parameter was not sent or not set"),
+    Stream("FILE_TRANSFER_PROTOCOL", End.CONTROLLER, None, "refusal of the files that stations request first"),
     Stream(
         "TIMESYNC", End.BOTH, 1.0, "real time only: how far the other end's clock is ahead; 20 Hz for the first ten"
     ),
@@ -66,17 +66,17 @@ STREAMS = (
         "CAN_FRAME",
         End.EMULATOR,
         None,
-        "on the tap's own link (`--tap`): the motor bus, while 32000 is renewed within 5 s",
+        "on the tap's own link (`--tap`): the motor bus, while the request 32000 is renewed within 5 s",
     ),
     Stream(
         "HIL_STATE_QUATERNION", End.EMULATOR, None, "the true state, on request (511, 512, `--truth`); no law reads it"
     ),
-    Stream("ODOMETRY", End.EMULATOR, None, "the same to the full: float metres, body rates"),
+    Stream("ODOMETRY", End.EMULATOR, None, "the true state in floats: metres, body rates; on request"),
     Stream(
         "RAW_RPM",
         End.EMULATOR,
         None,
-        "drives on a bus: how fast each says it turns; 10 Hz to a ground station, or on request",
+        "drives on a bus: the speed that each reports; 10 Hz to a ground station, or on request",
     ),
     Stream(
         "COMMAND_LONG",
@@ -84,12 +84,12 @@ STREAMS = (
         None,
         "400 (arm, disarm) to the controller; 511, 512 (a message at a rate, once) and 32000 (CAN) to the emulator",
     ),
-    Stream("COMMAND_ACK", End.BOTH, None, "the answer to it"),
+    Stream("COMMAND_ACK", End.BOTH, None, "the answer to COMMAND_LONG"),
 )
 
 
 def stream(message: str) -> Stream:
-    """The row of `message`. Raises KeyError where the table has none."""
+    """The row of `message`. Raises KeyError for a message not in the table."""
     for row in STREAMS:
         if row.message == message:
             return row
@@ -97,7 +97,7 @@ def stream(message: str) -> Stream:
 
 
 def markdown_table() -> Iterator[str]:
-    """The lines of the table as it stands in the README."""
+    """The lines of the table in the README."""
     yield "| message | sent by | rate | rule |"
     yield "| --- | --- | --- | --- |"
     for row in STREAMS:

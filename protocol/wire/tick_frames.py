@@ -1,7 +1,7 @@
-"""The frames of a tick, sealed in compiled code: pose and tick one way, the command the other.
+"""The frames of a tick, sealed in compiled code: pose and tick to the controller, the command to the emulator.
 
-The kernels are called by those of either end. Each takes a packed structure (`protocol.compiled.pack`) that holds the
-messages it fills (`pose` and `tick`, or `command`) and the bytes `out` that it writes.
+The kernels are called by the kernels of both ends. Each takes a packed structure (`protocol.compiled.pack`) with the
+messages that it fills (`pose` and `tick`, or `command`) and the bytes `out` that it writes.
 """
 
 from __future__ import annotations

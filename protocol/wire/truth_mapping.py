@@ -1,6 +1,6 @@
-"""The true state as MAVLink messages, for logs, ground stations and autopilots that compare; never for the laws.
+"""The true state as MAVLink messages, for logs, ground stations and comparison in autopilots; never for the laws.
 
-Each is what the emulator integrates, without noise, at the time of a tick.
+All values are the integrated state of the emulator, without noise, at the time of a tick.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _PER_MINUTE = 60.0 / (2.0 * math.pi)
 def encode_state(
     t_ns: int, motion: FloatArray, rates: FloatArray, place: tuple[float, float, float], force: FloatArray
 ) -> bytes:
-    """HIL_STATE_QUATERNION payload; what a field cannot hold is held at its end.
+    """HIL_STATE_QUATERNION payload; values are saturated at the range of their field.
 
     motion (12,): position, attitude, velocity (north, east, down), attitude rates; rates (3,): body rates; place: latitude
     and longitude (deg), altitude (m); force (3,): specific force in the body frame (m/s^2). There is no wind: both airspeeds
@@ -69,12 +69,12 @@ def encode_odometry(t_ns: int, motion: FloatArray, rates: FloatArray) -> bytes:
 
 
 def encode_rpm(drive: int, velocity: float) -> bytes:
-    """RAW_RPM payload of a drive (from 0 on) that turns with `velocity` (rad/s)."""
+    """RAW_RPM payload of a drive (counted from 0) with speed `velocity` (rad/s)."""
     return RPM.pack_fields(index=drive, frequency=velocity * _PER_MINUTE)
 
 
 def _held(value: float) -> float:
-    """The value, or the end of what a float32 can hold."""
+    """The value saturated at the range of a float32."""
     return max(-_LARGEST, min(_LARGEST, float(value)))
 
 

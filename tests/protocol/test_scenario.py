@@ -681,7 +681,7 @@ class TestOverrides:
             ({"rate_hz": -1.0}, "rate_hz"),
             ({"seed": -1}, "seed"),
             ({"duration_s": math.nan}, "duration_s"),
-            ({"rate_hz": 800.0}, "substep_s 0.0005 does not fit"),
+            ({"rate_hz": 800.0}, "substep_s 0.0005 does not divide the period"),
             ({"rte_hz": 500.0}, "did you mean 'rate_hz'?"),
         ],
     )

@@ -120,7 +120,7 @@ def test_any_cell_can_be_asked_for(
     [
         (("nowhere",), "there is no scenario nowhere"),
         (("flapper", "--law", "lqr"), "there is no law 'lqr'"),
-        (("flapper", "--rate", "300"), "no whole number of microseconds"),
+        (("flapper", "--rate", "300"), "not a whole number of microseconds"),
         (("flapper", "--gain-ratio", "0"), "--gain-ratio"),
         (("flapper", "--n-filter", "-1"), "--n-filter"),
     ],
