@@ -24,6 +24,8 @@ DONE, DEFINITION, ROOM = range(3)
 _HEAD = 3
 _NO_FIT, _CUT = -1, -2
 _DATA, _FORMAT, _SUBSCRIBE, _UNSUBSCRIBE = ord("D"), ord("F"), ord("A"), ord("R")
+_KNOWN = np.frombuffer(b"OSBLCMQIP", dtype=np.uint8)
+"""The types, beside those named above, whose bodies `body_fits` knows."""
 _SYNC = np.frombuffer(b"\x2f\x73\x13\x20\x25\x0c\xbb\x12", dtype=np.uint8)
 _LOOKED_AT = 64
 _FOREIGN_IN_A_ROW = 8
@@ -103,6 +105,17 @@ def chain_begins(data: Bytes, at: int, least: Sizes, most: Sizes) -> bool:
 
 
 @compiled
+def is_known(data: Bytes, at: int, kind: int, least: Sizes) -> bool:
+    """Whether messages of that type, of a topic with the number at `at` if they are data, are known: one must then fit."""
+    if kind == _DATA:
+        return bool(at + 2 <= data.shape[0] and least[uint16(data, at)] >= 0)
+    known = kind == _FORMAT or kind == _SUBSCRIBE or kind == _UNSUBSCRIBE
+    for letter in _KNOWN:
+        known = known or kind == letter
+    return known
+
+
+@compiled
 def foreign_end(data: Bytes, at: int, least: Sizes, most: Sizes) -> int:
     """Where a message ends that is of an unknown type, or of an unknown topic; -1 where what follows does not bear it out.
 
@@ -117,6 +130,8 @@ def foreign_end(data: Bytes, at: int, least: Sizes, most: Sizes) -> int:
         letter = (kind >= ord("A") and kind <= ord("Z")) or (kind >= ord("a") and kind <= ord("z"))
         if not letter or size == 0 or place + _HEAD + size > count:
             return _NO_FIT
+        if is_known(data, place + _HEAD, kind, least) and not body_fits(data, place + _HEAD, kind, size, least, most):
+            return _NO_FIT  # its size is damaged: who believed it would lose the messages behind it
         place += _HEAD + size
         if place == count or chain_begins(data, place, least, most):
             break

@@ -127,7 +127,7 @@ def test_drives_that_end_before_the_run_does_end_it_at_once(tmp_path: Path) -> N
         os.kill(drives, signal.SIGTERM)
         _, errors = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 4
-    assert_one_line(errors, "the process of the drives ended, and the run with it: see what ends it")
+    assert_one_line(errors, "the process of the drives ended, which ended the run")
     truth = load_truth(folder / "ground_truth.npy")
     assert 0 < len(truth) < 15_000
     assert json.loads((folder / "emulator.json").read_text())["counters"]["motor_outage_ticks"] == 0

@@ -129,7 +129,7 @@ class TestEnvelope:
         end = End()
         for k in range(PENDING):
             end.say(k * PERIOD_NS, INSIDE, delay_ns=10**12)
-        with pytest.raises(DivergenceError, match="commands are on their way"):
+        with pytest.raises(DivergenceError, match="delayed commands are pending"):
             end.say(PENDING * PERIOD_NS, INSIDE, delay_ns=10**12)
 
 

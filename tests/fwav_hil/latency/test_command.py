@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 
 from bridge.command_line import run_command
+from bridge.endpoint import Endpoint
 from bridge.latency.responder import respond
 from bridge.latency.segments import CONTROLLER_FILE, EMULATOR_FILE, load_legs
 from bridge.links.faults import DelayedLink
@@ -313,7 +314,7 @@ class TestARealLink:
         """Somebody who answers TIMESYNC; gives the link to them."""
         stop = StopFlag()
         with open_link("udpin://127.0.0.1:0") as link:
-            thread = threading.Thread(target=respond, args=(link, stop))
+            thread = threading.Thread(target=respond, args=(Endpoint(link, 1, 1), stop))
             thread.start()
             yield counterpart(link.uri)
             stop.requested = True

@@ -43,7 +43,7 @@ def test_every_frame_goes_to_the_bus_in_time(
     ("arguments", "code", "words"),
     [
         (("a.log", "--to", "can:virtual:x", "--types", "HEARTBEAT"), 2, "--types: of no effect on a log of a CAN bus"),
-        (("a.log", "--to", "can:nowhere"), 2, "names no CAN bus"),
+        (("a.log", "--to", "can:nowhere"), 2, "is not a CAN bus URI"),
         (("b.tlog", "--to", "can:virtual:x"), 6, "b.tlog is no log of a CAN bus"),
     ],
 )

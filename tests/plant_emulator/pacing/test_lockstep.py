@@ -450,7 +450,7 @@ class TestAnswers:
 
 class TestSilence:
     def test_the_same_bytes_go_out_again_after_growing_waits_for_two_seconds(self, tmp_path: Path) -> None:
-        with pytest.raises(PeerLostError, match=r"gave no answer to the tick at t = 0\.008 s for 2 s") as caught:
+        with pytest.raises(PeerLostError, match=r"did not answer the tick at t = 0\.008 s within 2 s") as caught:
             fly_script(tmp_path / "run.tlog", 5, lambda writer, number: [command(writer, number)] if number < 2 else [])
         assert "the script" in str(caught.value)
 

@@ -108,11 +108,11 @@ class TestController:
             meet(monkeypatch, Script(version(stranger), beat()))
         with pytest.raises(PeerMissingError, match="did not arm"):
             meet(monkeypatch, Script(version(), beat(stranger)))
-        with pytest.raises(PeerMissingError, match="no controller came"):
+        with pytest.raises(PeerMissingError, match="no controller connected"):
             meet(monkeypatch, Script(version(stranger), beat(stranger)))
 
     def test_another_scenario_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        with pytest.raises(ScenarioMismatchError, match="the controller holds another scenario"):
+        with pytest.raises(ScenarioMismatchError, match="the controller runs another scenario"):
             meet(monkeypatch, Script(version(digest=b"another!"), beat()))
 
     @STRANGERS
@@ -137,7 +137,7 @@ class TestController:
     def test_requests_are_answered_meanwhile(self, monkeypatch: pytest.MonkeyPatch) -> None:
         asked = mapping.COMMAND_LONG.pack_fields(command=512, param1=115.0)
         link = Script(FrameWriter(255, 190).seal(mapping.COMMAND_LONG, asked))
-        with pytest.raises(PeerMissingError, match="no controller came"):
+        with pytest.raises(PeerMissingError, match="no controller connected"):
             meet(monkeypatch, link)
         assert link.sent == [(1, [ACK])]
 
@@ -168,7 +168,7 @@ class TestAutopilot:
     @STRANGERS
     def test_a_strangers_words_do_not(self, monkeypatch: pytest.MonkeyPatch, stranger: tuple[int, int]) -> None:
         link = Script(beat(stranger))
-        with pytest.raises(PeerMissingError, match=r"no autopilot came to udpin://.* within 1 s"):
+        with pytest.raises(PeerMissingError, match=r"no autopilot connected to udpin://.* within 1 s"):
             meet(monkeypatch, link, autopilot=True)
         assert link.clock.now_ns() >= 6 * 10**9
         assert [ids for _, ids in link.sent] == [[BEAT]] * len(link.sent)

@@ -101,6 +101,13 @@ class TestDamage:
         assert log.counts()["imu"] == 299
         assert {name: count for name, count in log.counters.items() if count} == {"truncated_tail": 8}
 
+    def test_a_wrong_size_that_leads_to_another_message_is_not_believed(self, tmp_path: Path) -> None:
+        rows = imu_rows(60)
+        rows[1] = bytes([11 * len(rows[1]) - 3]) + rows[1][1:]  # ends where row 12 begins
+        log = opened(tmp_path, ulog_header(START_US) + IMU + b"".join(rows))
+        assert log.tables()["imu"]["x"].tolist() == [0, *range(2, 60)]
+        assert log.counters["damaged_bytes"] == len(rows[1])
+
     @settings(deadline=None)
     @given(st.data())
     def test_bytes_lost_or_put_in_cost_the_messages_that_they_hit(self, data: st.DataObject) -> None:
