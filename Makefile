@@ -2,13 +2,14 @@
 # make test   the same environment, the whole test suite
 # make check  what CI runs: test, lint, types, layers
 # make fuzz   100 000 damaged logs of each format for the readers; takes hours, so CI has 100 of each among its tests
+# make mutants  small faults in the safety-critical rooms, one by one: which of them does no test find?
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 EXTRAS := can,logs,plots,studies,dev
 
-.PHONY: run test check lint types layers bench fuzz clean
+.PHONY: run test check lint types layers bench fuzz mutants clean
 .DELETE_ON_ERROR:
 
 run: $(READY)
@@ -34,6 +35,10 @@ bench: $(READY)
 
 fuzz: $(READY)
 	$(BIN)/python -m tests.fuzz
+
+mutants: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS),mutants]'
+	nice $(BIN)/python -m tests.mutants
 
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

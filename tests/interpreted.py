@@ -29,6 +29,8 @@ def interpreted(function: Callable[..., Any]) -> Callable[..., Any]:
 def _as_records(argument: Any) -> Any:
     if type(argument) is np.ndarray and argument.dtype.names:
         return argument.view(np.recarray)
+    if type(argument) is np.void and argument.dtype.names:
+        return argument.view((np.record, argument.dtype))
     return argument
 
 

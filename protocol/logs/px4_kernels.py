@@ -109,7 +109,7 @@ def is_known(data: Bytes, at: int, kind: int, least: Sizes) -> bool:
     """Whether messages of that type, of a topic with the number at `at` if they are data, are known: one must then fit."""
     if kind == _DATA:
         return bool(at + 2 <= data.shape[0] and least[uint16(data, at)] >= 0)
-    known = kind == _FORMAT or kind == _SUBSCRIBE or kind == _UNSUBSCRIBE
+    known = kind in (_FORMAT, _SUBSCRIBE, _UNSUBSCRIBE)
     for letter in _KNOWN:
         known = known or kind == letter
     return known

@@ -109,7 +109,7 @@ class TestCommands:
         self, end: End, writer: FrameWriter, mode: int, armed: bool
     ) -> None:
         end.hear(command_of(writer, 0, [0.5] * 6, mode))
-        assert end.source.armed is armed
+        assert end.source.armed == armed
 
     def test_each_one_in_a_datagram_is_found_in_turn(self, end: End, writer: FrameWriter) -> None:
         end.source.feed(command(writer, 0) + command(writer, PERIOD_NS, OTHER_TAU))

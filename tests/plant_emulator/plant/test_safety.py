@@ -116,6 +116,14 @@ def test_one_nanosecond_too_old_is_stale(envelope: SafetyEnvelope) -> None:
     assert envelope.stale_output(STALENESS_NS + 1) is not None
 
 
+@pytest.mark.parametrize("came_ns", [0, 1, 2])
+def test_whenever_a_command_came_it_grows_stale(envelope: SafetyEnvelope, came_ns: int) -> None:
+    passed(envelope, came_ns, INSIDE)
+    stale = envelope.stale_output(came_ns + STALENESS_NS + 1)
+    assert stale is not None
+    assert stale[0] == came_ns + STALENESS_NS
+
+
 def test_every_command_even_a_disarmed_one_starts_the_time_anew(envelope: SafetyEnvelope) -> None:
     passed(envelope, 0, INSIDE)
     passed(envelope, STALENESS_NS, INSIDE, armed=False)
