@@ -6,7 +6,7 @@ import enum
 
 import numpy as np
 
-from protocol.compiled import Packed, compiled, pack
+from protocol.compiled import Packed, compiled, entry_point, pack
 from protocol.messages import FloatArray
 from protocol.wire.codec import Frame, FrameReader, frame_of
 from protocol.wire.framing import Bytes, Table, next_frame, take_payload
@@ -113,6 +113,7 @@ class CommandSource:
             {"command": COMMAND.dtype},
         )
         self._arguments = (reader.reading, reader.table, self._rows, self.memory)
+        self._receive = entry_point(receive, b"", 0, *self._arguments, 0, 0)
         self._oldest_us = self._latest_us = 0
         self._offsets = self._rows["offset"]
         self._data = b""
@@ -130,7 +131,7 @@ class CommandSource:
     def read(self) -> Found:
         """Continue reading, up to the next command that may act; see `receive`."""
         data, begun = self._data, self._at
-        found, self._at, count, newest_us, self.armed = receive(
+        found, self._at, count, newest_us, self.armed = self._receive(
             data, begun, *self._arguments, self._oldest_us, self._latest_us
         )
         self.newest_ns = newest_us * 1000

@@ -28,7 +28,7 @@ from plant_emulator.plant.safety import SafetyEnvelope, pass_command
 from plant_emulator.plant.sensors import NOISE_BLOCK, InertialSensors, PositionSensor, add_noise, inertial_readings
 from plant_emulator.plant.truth import TruthWriter
 from plant_emulator.station import EmulatorStation
-from protocol.compiled import Packed, compiled, pack
+from protocol.compiled import Packed, compiled, entry_point, pack
 from protocol.errors import DivergenceError
 from protocol.messages import VEHICLE, FloatArray
 from protocol.scenario import Scenario
@@ -134,6 +134,7 @@ class Emulator:
         self._out: Output = self._memory["out"][0]
         plant, envelope = self.plant, self.safety.packed
         self._packed = (plant.state.packed, plant.parameters, envelope, self.source.memory, self._memory)
+        self._steps = entry_point(_steps, *self._packed, *[0] * 9)
         self._waits = 0
         """ACT, where the newest command is to act before anything else happens to the plant."""
         self._arrival_ns = self._acts_ns = 0
@@ -202,7 +203,7 @@ class Emulator:
             self._memory["noise"][0], self._at = self._position.draw(NOISE_BLOCK), 0
         self._waits = 0
         self._sequence = sequence = writer.sequence
-        outcome, self._middle, self._end = _steps(
+        outcome, self._middle, self._end = self._steps(
             *self._packed, waits | steps, self._at, self.plant.t_ns, end_ns, self._arrival_ns, self._acts_ns, sequence,
             writer.system, writer.component,
         )  # fmt: skip

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from controller.sources.source import Found, PoseSource
-from protocol.compiled import Packed, compiled, pack
+from protocol.compiled import Packed, compiled, entry_point, pack
 from protocol.messages import FloatArray
 from protocol.wire.codec import FrameReader, frame_of
 from protocol.wire.framing import Bytes, Table, next_frame, take_payload
@@ -104,6 +104,7 @@ class HilSource(PoseSource):
         )
         self._newest_us = self._memory["newest_us"]
         self._arguments = (reader.reading, reader.table, self._rows, self._memory)
+        self._receive = entry_point(receive, b"", 0, *self._arguments)
         self._data = b""
         self._at = 0
         self.q: FloatArray = self._memory["q"][0]
@@ -115,7 +116,7 @@ class HilSource(PoseSource):
     def read(self) -> Found:
         """Continue reading, up to the next sample; see `receive`."""
         data = self._data
-        found, self._at, others = receive(data, self._at, *self._arguments)
+        found, self._at, others = self._receive(data, self._at, *self._arguments)
         self.is_read = self._at == len(data)
         if others:
             self.others += [frame_of(data, row) for row in self._rows[:others].tolist()]

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import common
 
+from protocol.compiled import entry_point
 from protocol.wire import framing
 from protocol.wire.framing import CAUSES, CRC_SIZE, HEADER_V2, KNOWN, LONGEST_FRAME, MAGIC_V2, SIZE_SHIFT, Table
 
@@ -127,12 +128,12 @@ class FrameWriter:
         self.component = component
         self.sequence = 0
         self._out = np.zeros(LONGEST_FRAME, dtype=np.uint8)
-        framing.seal_frame(self._out, 0, b"", 0, 0, system, component, 0, 0)  # compiled now, not with the first frame
+        self._seal_frame = entry_point(framing.seal_frame, self._out, 0, b"", 0, 0, system, component, 0, 0)
 
     def seal(self, message: Layout, payload: bytes) -> bytes:
         """One frame: header, payload without trailing zeros (at least one byte), checksum."""
         sequence, out = self.sequence, self._out
-        end = framing.seal_frame(
+        end = self._seal_frame(
             out, 0, payload, 0, sequence, self.system, self.component, message.message_id, message.crc_seed
         )
         self.sequence = (sequence + 1) & 0xFF
@@ -182,7 +183,7 @@ class FrameReader:
         self._is_datagram = is_datagram
         self._rest = b""
         self._counted, self._next = self.reading["counters"][0], self.reading["next"][0]
-        framing.read_frames(b"", 0, self.reading, self.table, self.rows)  # compiled now, not with the first frame
+        self._read_frames = entry_point(framing.read_frames, b"", 0, self.reading, self.table, self.rows)
 
     @property
     def counters(self) -> dict[str, int]:
@@ -210,7 +211,7 @@ class FrameReader:
     def read(self, data: bytes) -> list[Frame]:
         """The intact frames in `data`; on a stream link, a frame begun in one call is completed in the next."""
         data = self.whole(data)
-        count, at = framing.read_frames(data, 0, self.reading, self.table, self.rows)
+        count, at = self._read_frames(data, 0, self.reading, self.table, self.rows)
         if (
             count == 1
             and data[0] == MAGIC_V2
@@ -220,7 +221,7 @@ class FrameReader:
             return [lone_frame(data)]  # as nearly always
         frames = [frame_of(data, row) for row in self.rows[:count].tolist()]
         while at >= 0:
-            count, at = framing.read_frames(data, at, self.reading, self.table, self.rows)
+            count, at = self._read_frames(data, at, self.reading, self.table, self.rows)
             frames += [frame_of(data, row) for row in self.rows[:count].tolist()]
         self.keep_rest(data)
         return frames

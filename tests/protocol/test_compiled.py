@@ -135,6 +135,19 @@ def outer(value: float) -> float:
 """
 
 
+class TestEntryPoint:
+    def test_it_computes_what_the_kernel_does(self) -> None:
+        kernel = ours.compiled(double)
+        assert ours.entry_point(kernel, 1.0)(21.0) == kernel(21.0) == 42.0
+
+    def test_the_number_of_arguments_is_checked(self) -> None:
+        with pytest.raises(TypeError, match="expected 1 argument"):
+            ours.entry_point(ours.compiled(double), 1.0)(1.0, 2.0)  # type: ignore[call-arg]
+
+    def test_without_numba_it_is_the_function(self) -> None:
+        assert ours.entry_point(double, 1.0) is double
+
+
 class TestTroubledCache:
     @pytest.mark.parametrize("ending", [".nbi", ".nbc"])
     @pytest.mark.parametrize("share", [0.0, 0.5, 0.99])

@@ -77,7 +77,7 @@ class TestRates:
     @pytest.mark.parametrize("call", [lambda one: one.set_rate(331, 1.0), lambda one: one.ask_once(331)])
     def test_what_is_not_said_here_cannot_be_asked_for(self, call: object) -> None:
         one = schedule("HEARTBEAT")
-        with pytest.raises(KeyError, match="no message 331 is said here"):
+        with pytest.raises(KeyError, match="message 331 has no encoder here"):
             call(one)  # type: ignore[operator]
         assert said(one, 0) == ["HEARTBEAT"]
 
