@@ -20,7 +20,8 @@ import numpy as np
 from benchmarks.row import row
 from bridge.motor_bus.can_bus import CanBus
 from protocol.can_frame import CanFrame
-from protocol.motors.motor_protocol import PROTOCOLS, Cause, make_drive, make_host
+from protocol.motors.motor_protocol import Cause, make_drive, make_host
+from protocol.motors.registry import PROTOCOLS
 from protocol.scenario import Motor
 
 GROUP = "239.74.163.2"

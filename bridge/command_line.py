@@ -10,7 +10,6 @@ from typing import Any
 import click
 
 from bridge.extras import remedy
-from bridge.links.link import Medium, scheme_of
 from bridge.process import StopFlag
 from bridge.reporting import Report
 from protocol.errors import FwavHilError, Interrupted, RunFolderError, UsageError
@@ -18,6 +17,8 @@ from protocol.errors import FwavHilError, Interrupted, RunFolderError, UsageErro
 
 def refuse_rate_that_cannot_fit(uri: str, rate_hz: float) -> None:
     """Raise UsageError where a serial line is too slow for the messages at a rate; other links are not checked."""
+    from bridge.links.link import Medium, scheme_of  # not needed for a command's help
+
     if scheme_of(uri).medium is Medium.SERIAL:
         from bridge.latency.budget import link_budget
 

@@ -19,7 +19,7 @@ from bridge.shared_options import (
     Station,
     folder_option,
 )
-from protocol.motors.motor_protocol import PROTOCOLS
+from protocol.motors.registry import PROTOCOLS
 from protocol.scenario import Scenario, with_overrides
 
 _WITH_A_BUS = "--motor can"

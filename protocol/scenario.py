@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import difflib
 import hashlib
-import json
 import math
 import re
 import tomllib
@@ -340,7 +339,7 @@ class Scenario(Table, frozen=True):
     def _digest(self, *, without_motor: bool) -> bytes:
         common = msgspec.structs.replace(self, rate_hz=1000.0, substep_s=0.001, duration_s=1.0, seed=0, law="")
         document = msgspec.to_builtins(common)
-        document["gains"] = json.loads(json.dumps(document["gains"]), parse_int=float)  # 2 counts as 2.0
+        document["gains"] = _with_float_numbers(document["gains"])  # 2 counts as 2.0
         if without_motor:
             del document["motor"]
         return hashlib.sha256(msgspec.json.encode(document, order="sorted")).digest()[:8]
@@ -474,3 +473,12 @@ def _known_keys(kind: type[Table], place: str, document: dict[str, Any]) -> list
     elif place:
         kind = globals()[kind.__annotations__[place]]
     return list(kind.__struct_fields__)
+
+
+def _with_float_numbers(value: Any) -> Any:
+    """The same JSON value with each whole number as a float."""
+    if isinstance(value, dict):
+        return {name: _with_float_numbers(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_with_float_numbers(one) for one in value]
+    return float(value) if type(value) is int else value

@@ -1,7 +1,7 @@
 """Interface of the CAN motor protocols: torque commands for six axes to frames, and frames to orders and readings.
 
 A protocol is one file with a `Host` (the commanding end), a `Drive` (the six drives) and a `traffic` list, and one line in
-PROTOCOLS. Neither end does I/O or reads the time. Torques are fractions of full scale here (1 is `actuators.scale`
+`registry.PROTOCOLS`. Neither end does I/O or reads the time. Torques are fractions of full scale here (1 is `actuators.scale`
 of the axis), angles in rad at the shaft; each protocol's file describes its own units.
 
 A rejected frame does not raise an exception: it gives a cause, one of CAUSES, which the caller counts.
@@ -12,13 +12,13 @@ from __future__ import annotations
 import abc
 import enum
 import importlib
-from collections.abc import Iterable, Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Iterable, Sequence
 from typing import Any, Final, NamedTuple
 
 from protocol.can_frame import CanFrame, worst_bits
 from protocol.errors import UsageError
 from protocol.messages import AXES, FloatArray
+from protocol.motors.registry import PROTOCOLS
 from protocol.scenario import Motor
 
 DRIVES: Final = len(AXES)
@@ -176,16 +176,6 @@ class Drive(abc.ABC):
     @abc.abstractmethod
     def restart(self) -> None:
         """Restart the schedule of the cyclic messages, after a jump of the time that is passed to `cyclic`."""
-
-
-PROTOCOLS: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "odrive": "protocol.motors.odrive",
-        "mit": "protocol.motors.mit",
-        "dronecan": "protocol.motors.dronecan_esc",
-    }
-)
-"""Name -> module with `Host`, `Drive` and `traffic(motor, rate_hz)`. Imported at first use."""
 
 
 def make_host(name: str, motor: Motor) -> Host:

@@ -8,7 +8,8 @@ import pytest
 
 from bridge.motor_bus.can_load import BITRATES, load, plan_bus, response_ns, worst_response_s
 from protocol.errors import UsageError
-from protocol.motors.motor_protocol import PROTOCOLS, Traffic
+from protocol.motors.motor_protocol import Traffic
+from protocol.motors.registry import PROTOCOLS
 from protocol.scenario import Motor
 
 

@@ -31,7 +31,8 @@ from plant_emulator.plant.truth import load_truth
 from protocol.can_frame import CanFrame
 from protocol.errors import LinkInUseError, PeerLostError, PeerMissingError, ScenarioMismatchError, UsageError
 from protocol.messages import AXES
-from protocol.motors.motor_protocol import PROTOCOLS, make_host
+from protocol.motors.motor_protocol import make_host
+from protocol.motors.registry import PROTOCOLS
 from protocol.motors.simulation_sync import decode_answer, decode_sync, encode_answer, encode_hello, encode_sync
 from protocol.scenario import Scenario
 from tests.dbc import our_dbc

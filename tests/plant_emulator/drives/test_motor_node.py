@@ -10,7 +10,8 @@ import pytest
 
 from plant_emulator.drives.motor_node import HOST_GONE_NS, RUN_OVER_NS, MotorNode, is_of_drives
 from protocol.can_frame import CanFrame
-from protocol.motors.motor_protocol import PROTOCOLS, Fault, Host, make_host
+from protocol.motors.motor_protocol import Fault, Host, make_host
+from protocol.motors.registry import PROTOCOLS
 from protocol.motors.simulation_sync import (
     ALL_AXES,
     decode_answer,
