@@ -32,6 +32,7 @@ PYTEST = (
 
 _PACING = "tests/plant_emulator/pacing"
 _LOCKSTEP = f"{_PACING}/test_lockstep.py::TestAnswers {_PACING}/test_lockstep.py::TestSilence"
+_REAL_TIME = f'{_PACING}/test_real_time.py -k "not three_seconds"'
 _CODEC = "tests/protocol/wire/test_codec.py"
 _TOLERANT = f"{_PACING}/test_tolerant.py::TestScript"
 ROOMS = {
@@ -44,8 +45,8 @@ ROOMS = {
     "plant_emulator/plant/safety.py": "tests/plant_emulator/plant/test_safety.py",
     "plant_emulator/pacing/lockstep.py": _LOCKSTEP,
     "plant_emulator/pacing/meeting.py": f"{_PACING}/test_meeting.py",
-    "plant_emulator/pacing/pacing.py": f"{_LOCKSTEP} {_TOLERANT} {_PACING}/test_real_time.py",
-    "plant_emulator/pacing/real_time.py": f"{_PACING}/test_real_time.py",
+    "plant_emulator/pacing/pacing.py": f"{_LOCKSTEP} {_TOLERANT} {_PACING}/test_real_time.py::TestTimes",
+    "plant_emulator/pacing/real_time.py": _REAL_TIME,
     "plant_emulator/pacing/tolerant.py": _TOLERANT,
     "protocol/wire/framing.py": f"tests/protocol/wire/test_framing.py {_CODEC}::TestForeignFrames {_CODEC}::TestSequence",
     "protocol/wire/signing.py": "tests/protocol/wire/test_signing.py",

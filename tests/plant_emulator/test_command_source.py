@@ -45,13 +45,14 @@ class End:
         names = {mapping.HEARTBEAT.message_id: "beat", mapping.COMMAND.message_id: "command"}
         while (data := self._far.recv(0.0)) is not None:
             self.source.feed(data)
-            found = None
-            while found is not Found.NOTHING:
+            while True:
                 found = self.source.read()
                 others, self.source.others = self.source.others, []
                 heard += [names[frame.message_id] for frame in others]
                 if found is Found.COMMAND:
                     heard.append(self.source.newest_ns)
+                if self.source.is_read:
+                    break
         return heard
 
     def counted(self) -> dict[str, int]:
@@ -126,6 +127,18 @@ class TestCommands:
             assert end.hear(data[:cut], data[cut:]) == ["beat", 0, PERIOD_NS], cut
             assert b"".join(end.source.raws) == data
             assert end.counted() == {}
+
+    @pytest.mark.parametrize("count", [1, 64])
+    @pytest.mark.parametrize("armed", [None, True, False])
+    def test_what_else_comes_changes_nothing_of_it(
+        self, end: End, writer: FrameWriter, armed: bool | None, count: int
+    ) -> None:
+        if armed is not None:
+            end.hear(command(writer, PERIOD_NS, armed=armed))
+        before = end.source.newest_ns
+        assert end.hear(b"".join(beat(writer) for _ in range(count))) == ["beat"] * count
+        assert end.source.armed == bool(armed)
+        assert (end.source.newest_ns // PERIOD_NS, end.source.newest_ns < 0) == (before // PERIOD_NS, armed is None)
 
 
 class TestWhoIsBelieved:

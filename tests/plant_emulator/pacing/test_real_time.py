@@ -53,6 +53,12 @@ def fly(request: pytest.FixtureRequest, tmp_path: Path) -> Fly:
     return functools.partial(fly_some, tmp_path / "truth.npy", sleeps_through=request.param)
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fifty periods of silence are too many."""
+    monkeypatch.setattr("plant_emulator.pacing.real_time.HEARTBEAT_TIMEOUT_NS", 50 * PERIOD_NS)
+
+
 def answer(writer: FrameWriter, t_ns: int) -> bytes:
     command = ActuatorCommand(t_ns, np.array([0.5, 0.5, 0.0, 0.0, 0.0, 0.0]) * SCALE, armed=True)
     return writer.seal(mapping.COMMAND, mapping.encode_command(command, SCALE, lockstep=False))
@@ -148,8 +154,8 @@ def mixed(writer: FrameWriter, tick: int) -> list[bytes]:
 
 
 def test_sleeping_through_a_period_changes_nothing_but_when_the_work_is_done(tmp_path: Path) -> None:
-    woken = fly_some(tmp_path / "woken.npy", 400, mixed)
-    slept = fly_some(tmp_path / "slept.npy", 400, mixed, sleeps_through=True)
+    woken = fly_some(tmp_path / "woken.npy", 100, mixed)
+    slept = fly_some(tmp_path / "slept.npy", 100, mixed, sleeps_through=True)
     assert slept.truth.read_bytes() == woken.truth.read_bytes()
     assert slept.link.sent == woken.link.sent
     assert slept.pacing.latencies_ns == woken.pacing.latencies_ns
@@ -206,21 +212,21 @@ class TestRefusals:
         assert flown.emulator.safety.counters["disarmed"] == 2
         assert flown.emulator.plant.state.tau.tolist() == [0.0] * 6
 
-    def test_a_strangers_words_do_not_keep_a_silent_run_alive(self, fly: Fly) -> None:
+    def test_a_strangers_words_do_not_keep_a_silent_run_alive(self, fly: Fly, impatient: None) -> None:
         stranger = FrameWriter(255, 190)
         beat = mapping.encode_controller_heartbeat(armed=True)
-        with pytest.raises(PeerLostError, match="3 s without"):
-            fly(1000, lambda _writer, _tick: [stranger.seal(mapping.HEARTBEAT, beat)])
+        with pytest.raises(PeerLostError, match="fell silent"):
+            fly(60, lambda _writer, _tick: [stranger.seal(mapping.HEARTBEAT, beat)])
 
     @pytest.mark.parametrize("spoken", ["heartbeat", "command"])
-    def test_the_controllers_words_do(self, fly: Fly, spoken: str) -> None:
+    def test_the_controllers_words_do(self, fly: Fly, impatient: None, spoken: str) -> None:
         def answers(writer: FrameWriter, tick: int) -> list[bytes]:
-            if tick % 250:  # one a second
+            if tick % 40:
                 return []
             beat = writer.seal(mapping.HEARTBEAT, mapping.encode_controller_heartbeat(armed=True))
             return [beat if spoken == "heartbeat" else answer(writer, tick * PERIOD_NS)]
 
-        assert fly(1500, answers).emulator.plant.t_ns == 1500 * PERIOD_NS
+        assert fly(120, answers).emulator.plant.t_ns == 120 * PERIOD_NS
 
     def test_the_time_is_told_to_the_controller_alone(self, fly: Fly) -> None:
         question = mapping.encode_timesync(0, 77)
