@@ -303,6 +303,17 @@ class TestMeeting:
         assert meeting.hellos() == [[mapping.HEARTBEAT.message_id, mapping.VERSION.message_id]] * 10
         assert len(meeting.listened_ns) == 10
 
+    def test_traffic_does_not_make_it_say_hello_more_often(self) -> None:
+        near, far = memory_pair()
+        clock = VirtualClock()
+        made = HilSession(Endpoint(near, 1, 1), DIGEST, EMULATOR, arm=True)
+        with pytest.raises(PeerMissingError):
+            made.meet(lambda _timeout_s: clock.advance_ns(10 * MS), lambda: False, clock, 1.0, StopFlag())
+        count = 0
+        while far.recv(0.0) is not None:
+            count += 1
+        assert count == 10
+
     def test_an_emulator_that_agreed_and_sends_no_tick_waits_for_arming(self) -> None:
         with pytest.raises(PeerMissingError, match="sent no tick within 1 s: arm this controller with --arm"):
             Meeting(arm=False).meet(lambda _count: [version()])

@@ -134,6 +134,18 @@ class TestController:
         assert len(times) in (9, 10)
         assert all(ids == [BEAT, VERSION] for _, ids in link.sent)
 
+    @pytest.mark.parametrize("autopilot", [False, True])
+    def test_traffic_does_not_make_it_say_hello_more_often(
+        self, monkeypatch: pytest.MonkeyPatch, autopilot: bool
+    ) -> None:
+        chatter = beat((255, 190)) if autopilot else beat(armed=False)
+        link = Script(*[chatter] * 500)
+        with pytest.raises(PeerMissingError):
+            meet(monkeypatch, link, autopilot=autopilot, wait_s=0.5)
+        hellos = [t_ms for t_ms, _ in link.sent]
+        assert hellos[-4:] == [100, 200, 300, 400]
+        assert len(hellos) == (5 if autopilot else 6), "at once, and to whom it does not know yet once more"
+
     def test_requests_are_answered_meanwhile(self, monkeypatch: pytest.MonkeyPatch) -> None:
         asked = mapping.COMMAND_LONG.pack_fields(command=512, param1=115.0)
         link = Script(FrameWriter(255, 190).seal(mapping.COMMAND_LONG, asked))
