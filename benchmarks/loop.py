@@ -16,7 +16,7 @@ from benchmarks.row import ALTERNATIONS, row
 from fwav_hil.simulate import simulate
 from protocol.scenario import find_scenario, load_scenario, with_overrides
 
-TICK_RATIO_BAR, TICK_BAR_US = 4.6, 100.0
+TICK_RATIO_BAR, TICK_BAR_US = 3.2, 100.0
 STEPS_BAR = 500_000.0
 
 _ROTORPY = """
