@@ -37,7 +37,7 @@ fuzz: $(READY)
 	$(BIN)/python -m tests.fuzz
 
 mutants: $(READY)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$(EXTRAS),mutants]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -c constraints-mutants.txt -e '.[$(EXTRAS),mutants]'
 	nice $(BIN)/python -m tests.mutants
 
 $(READY): pyproject.toml constraints.txt

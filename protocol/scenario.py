@@ -481,4 +481,4 @@ def _with_float_numbers(value: Any) -> Any:
         return {name: _with_float_numbers(one) for name, one in value.items()}
     if isinstance(value, list | tuple):
         return [_with_float_numbers(one) for one in value]
-    return float(value) if type(value) is int else value
+    return float(str(value)) if type(value) is int else value  # of text: one beyond all floats is infinite
